@@ -27,7 +27,7 @@ COMPARED = {
 _PAPER_RATE = [f"--optimizers.{device}-opt.optimizer.lr=1e-3" for device in ("camera", "projector")]
 ABLATIONS = {
     "no-pattern": ("--pipeline.model.losses.pattern", "0"),
-    "no-annealing": ("--pipeline.model.annealing.anneal-kappa", "False"),
+    "no-annealing": ("--pipeline.model.annealing.kappa", "constant"),
     "by-gradient": ("--pipeline.model.pose-method", "render", *_PAPER_RATE),
     "independent": ("--pipeline.model.pose-method", "render-independently", *_PAPER_RATE),
     "no-direct": (

@@ -24,7 +24,7 @@ from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.render import visible_centres
+from sl_nerfstudio.synthesis.render import FrameGeometry, visible_centres
 from sl_nerfstudio.synthesis.synthesise import make_setup, synthesise
 
 WRONG_PX = 2.0
@@ -149,7 +149,9 @@ def _truth(config: SynthConfig) -> tuple[Float32[ndarray, "n h w 2"], Float64[nd
     """Exact coordinates of all frames, NaN where no light falls; and what every fifth lit pixel sees."""
     setup = make_setup(config)
     poses = zip(setup.truth.T_world_camera, setup.truth.T_world_projector, strict=True)
-    seen = [visible_centres(setup.caster, setup.devices, camera, projector) for camera, projector in poses]
+    seen = [
+        visible_centres(FrameGeometry(setup.caster, setup.devices, camera, projector)) for camera, projector in poses
+    ]
     size = (setup.devices.camera.h, setup.devices.camera.w)
     maps = [np.where(s.lit[:, None], s.uv_projector, np.nan).reshape(*size, 2) for s in seen]
     return np.stack(maps).astype(np.float32), np.concatenate([s.p_world[s.lit][::5] for s in seen])

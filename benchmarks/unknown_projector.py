@@ -28,16 +28,16 @@ from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
 from sl_nerfstudio.relative_pose.intrinsics import camera_depth
 from sl_nerfstudio.relative_pose.unknown_projector import FrameMatches, NoProjector, estimate_projector
+from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import (
     CoordinateNoise,
-    DeviceOptions,
     DevicePair,
     disturb_coords,
     make_devices,
     make_paths,
     pixels,
 )
-from sl_nerfstudio.synthesis.render import RayCaster, visible_centres
+from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, visible_centres
 from sl_nerfstudio.synthesis.scenes import make_scene
 from sl_nerfstudio.synthesis.synthesise import make_cells
 
@@ -70,13 +70,13 @@ def make_set(options: SetOptions) -> CoordinateSet:
     """Render one set."""
     scene = make_scene(options.scene, 1.0)
     poses = make_paths(scene, options.frames, "hand-held", np.random.default_rng([options.seed, 1]))
-    devices = make_devices(scene, poses, PATTERN, DeviceOptions(_RESOLUTION))
+    devices = make_devices(scene, poses, PATTERN, SynthConfig(resolution=_RESOLUTION))
     projector, poses = _with_shift(devices.projector, poses, scene.vertices[::20], options)
     devices = DevicePair(devices.camera, projector)
     caster, cells = RayCaster(scene), make_cells(np.zeros(PATTERN[::-1], np.float32), None)
     coords, points = [], []
     for k in range(options.frames):
-        seen = visible_centres(caster, devices, poses.T_world_camera[k], poses.T_world_projector[k])
+        seen = visible_centres(FrameGeometry(caster, devices, poses.T_world_camera[k], poses.T_world_projector[k]))
         shape = devices.camera.h, devices.camera.w
         exact = np.where(seen.lit[:, None], seen.uv_projector, np.nan).astype(np.float32).reshape(*shape, 2)
         rng = np.random.default_rng([options.seed, 2, k])

@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
@@ -124,7 +124,7 @@ class Phase:
     _recent: deque[tuple[float, int]] = field(default_factory=deque)
 
     def update(self, done: int, total: int | None, note: str = "") -> None:
-        """How much of the work is done; the time left follows from the speed of the last half minute."""
+        """Note how much of the work is done; the time left follows from the speed of the last half minute."""
         now = time.monotonic()
         if total != self.total or done < self.done:
             self._recent.clear()
@@ -146,7 +146,7 @@ class Phase:
         return (self.total - done) * (now - start) / (done - before) if done > before else None
 
     def state(self) -> str:
-        """How far the phase is, in words."""
+        """Say how far the phase is."""
         count = f"{self.done} of {self.total}" if self.total else ""
         left = self.seconds_left
         return ", ".join(filter(None, [count, self.note, "" if left is None else f"{duration(left)} left"]))
@@ -190,7 +190,7 @@ def _live(found: Phase) -> Iterator[None]:
     """Show a bar in the last line of the terminal until the block ends."""
     ended = threading.Event()
     with _bar() as bar:
-        task = bar.add_task(found.name, total=None, state="")
+        task = bar.add_task(found.name, total=found.total, completed=found.done, state=found.state())
 
         def redraw() -> None:
             while not ended.wait(0.25):
@@ -230,54 +230,24 @@ def track(iterable: Iterable[T], description: str, total: int | None = None) -> 
     if total is None and hasattr(iterable, "__len__"):
         total = len(iterable)  # type: ignore[arg-type]
     if _phase is not None:
-        yield from _in_phase(iterable, _phase, description, total)
+        for done, item in enumerate(iterable):
+            _phase.update(done, total, description.lower())
+            yield item
         return
     if not sys.stderr.isatty():
         yield from iterable
         return
-    iterator = iter(iterable)
-    start = time.monotonic()
-    done = 0
-    for item in iterator:
-        yield item
-        done += 1
-        if not _shown and time.monotonic() - start > SHOW_AFTER_SECONDS:
-            _shown = True
-            break
-    else:
-        return
-    try:
-        yield from _with_bar(iterator, description, total, done)
-    finally:
-        _shown = False
-
-
-def _in_phase(iterable: Iterable[T], shown: Phase, description: str, total: int | None) -> Iterator[T]:
-    for done, item in enumerate(iterable):
-        shown.update(done, total, description.lower())
-        yield item
-
-
-def _with_bar(iterator: Iterator[T], description: str, total: int | None, done: int) -> Iterator[T]:
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task(description, total=total, completed=done)
-        for item in iterator:
+    found = Phase(description)
+    with ExitStack() as stack:
+        for done, item in enumerate(iterable):
+            found.update(done, total)
             yield item
-            progress.advance(task)
+            if not _shown and time.monotonic() - found.started > SHOW_AFTER_SECONDS:
+                _shown = True
+                stack.enter_context(_live(found))
+                stack.callback(_hide)
+
+
+def _hide() -> None:
+    global _shown
+    _shown = False

@@ -37,7 +37,7 @@ class Fault:
 
     @property
     def kind(self) -> tuple[str | None, ...]:
-        """The same for faults that differ only in their place and their numbers."""
+        """Equal for faults that differ only in their place and their numbers."""
         place = self.field if self.frame is not None else None  # without frames, it is the fields that differ
         file = self.file if self.frame is None else self.file.rpartition("/")[0]
         return (file, place, *(re.sub(r"\d[\d.]*", "#", text) for text in (self.problem, self.cause, self.remedy)))

@@ -1,6 +1,14 @@
-"""open3d without its web viewer and its machine learning, whose imports (dash, sklearn, pandas) take most of its start.
+"""Imports of other libraries without parts that this package never uses: seconds of every command's start.
 
-Both can still be imported later: the stand-ins are removed as soon as open3d is there.
+CPU seconds on one core, with torch 2.11, nerfstudio 1.1.5 and open3d 0.19:
+- `ns-train sl-neus`, `sl-export`: nerfstudio's import takes 5.9 instead of 9.7 without the compiler, torch._dynamo.
+  torchvision and one of nerfstudio's models ask for it as soon as they are imported, to use it in functions that this
+  package never calls, and torch's optimisers ask it to leave them alone. Within `compiler_on_demand()` they get
+  functions that fetch it when they are called.
+- `sl-synth`, `sl-eval`, `sl-export`: open3d's import takes 0.1 instead of 2.5 (besides torch's) without its web viewer
+  and its machine learning (dash, sklearn, pandas).
+
+All of it can still be imported later. tests/test_late_imports.py fails where a library no longer asks for these parts.
 """
 
 import sys
@@ -13,16 +21,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
-
-# nerfstudio imported without torch's compiler, which takes longer to import than all the rest.
-#
-# torchvision and one of nerfstudio's models ask for the compiler as soon as they are imported, to use it in
-# functions
-# that this package never calls, and torch's optimisers ask it to leave them alone. Within `compiler_on_demand()`
-# they get
-# functions that fetch it when they are called.
 
 _OURS = __name__.partition(".")[0]
 _COMPILER, _ASKED = "torch._dynamo", "is_compile_supported"
@@ -31,7 +30,7 @@ _importing = ExitStack()
 
 @contextmanager
 def compiler_on_demand(stays_out: bool = False) -> Iterator[None]:
-    """For the duration of imports; what they decorate with `torch.compile` is compiled when it is first called.
+    """Leave the compiler out of imports in the block; what `torch.compile` decorates is compiled when it is called.
 
     With `stays_out` torch itself does not fetch the compiler afterwards, either, until something compiles.
     """
@@ -47,27 +46,8 @@ def compiler_on_demand(stays_out: bool = False) -> Iterator[None]:
             _remove_placeholders()
 
 
-@contextmanager
-def shapes_without_symbols() -> Iterator[None]:
-    """`torch.broadcast_shapes`, which nerfstudio calls for every camera, without its import of sympy: half a second."""
-    real = torch.broadcast_shapes
-    torch.broadcast_shapes = _broadcast_shapes  # pyright: ignore[reportAttributeAccessIssue]
-    try:
-        yield
-    finally:
-        torch.broadcast_shapes = real
-
-
-def _broadcast_shapes(*shapes: Any) -> torch.Size:
-    """Of plain numbers. Raises RuntimeError, as torch, for shapes that do not fit."""
-    try:
-        return torch.Size(np.broadcast_shapes(*shapes))
-    except ValueError as error:
-        raise RuntimeError(str(error)) from error
-
-
 def begin_imports(command: list[str]) -> None:
-    """To be called by what nerfstudio imports first of this package, with the command line.
+    """Begin to leave the compiler out; called by what nerfstudio imports first of this package, with the command line.
 
     If that trains one of this package's methods, or loads a run of one, nothing in the process needs the compiler.
     """
@@ -96,7 +76,7 @@ def _begins_with(path: Path, name: str) -> bool:
 
 
 def end_imports() -> None:
-    """To be called by what nerfstudio imports last of this package."""
+    """End what `begin_imports` began; called by what nerfstudio imports last of this package."""
     _importing.close()
 
 
@@ -150,6 +130,8 @@ def _compiled_later(real: Callable[..., Any], model: Any = None, **settings: Any
 
     return run
 
+
+# open3d.
 
 _LEFT_OUT = {"open3d.ml": (), "open3d.visualization.draw_plotly": ("draw_plotly", "draw_plotly_server")}
 

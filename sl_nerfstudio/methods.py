@@ -8,10 +8,9 @@ from nerfstudio.plugins.types import MethodSpecification
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
 from sl_nerfstudio.late_imports import end_imports
-from sl_nerfstudio.model.model import SLModelConfig, paper_model
+from sl_nerfstudio.model.model import RECOMMENDED_STEPS, SLModelConfig, paper_model
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
-from sl_nerfstudio.model.settings import RECOMMENDED_STEPS
 from sl_nerfstudio.model.trainer import SLTrainerConfig, default_device
 
 # When nerfstudio has loaded this module, it asks for the call stack 26 times, and each time Python looks through all

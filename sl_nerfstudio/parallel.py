@@ -1,4 +1,4 @@
-"""Work on many frames or pairs of them, side by side on all threads, with its progress."""
+"""What this process may use of the machine, and work on many pieces side by side on all threads."""
 
 import ctypes
 import inspect
@@ -10,8 +10,9 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache, lru_cache, partial
+from itertools import product
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,69 +22,52 @@ from threadpoolctl import threadpool_limits
 
 from sl_nerfstudio.console import track
 
-# The control groups of Linux that this process is in, and what they allow (cgroups(7)).
+# What this process may use: as its affinity mask and its control groups (cgroups(7)) allow. joblib counts cores by the
+# outermost group alone, and knows nothing of the limit of the memory.
 
 ROOT, OWN = Path("/sys/fs/cgroup"), Path("/proc/self/cgroup")
 
 
-def groups_around(controller: str, root: Path, own: Path) -> list[Path]:
-    """Folders of the groups whose limits for a controller, "cpu" or "memory", hold for this process.
+def cores() -> int:
+    """Number of cores, at least 1. A container that is given two of 64 cores by a quota still sees 64."""
+    mask = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    quotas = [math.inf]
+    for stated in _group_limits("cpu", ("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us")):
+        with suppress(ValueError, ZeroDivisionError):  # "max"
+            allowed, period = map(float, stated)
+            quotas += [allowed / period] if allowed > 0 else []
+    return max(math.ceil(min(mask, *quotas)), 1)
 
-    `root` is where control groups are mounted, `own` lists those of the process: version 2 as `0::/a/b`, version 1 with
-    the controller's name. The limits of all groups around its own hold, too. A container sees its own group as the
-    root. Folders need not exist.
+
+def memory_of_process() -> int:
+    """Bytes of memory: the machine's, or fewer."""
+    limits = [os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")]
+    for stated in _group_limits("memory", ("memory.max",), ("memory.limit_in_bytes",)):
+        with suppress(ValueError):
+            limits += map(int, stated)
+    return min(limits)
+
+
+def _group_limits(controller: str, *files: tuple[str, ...]) -> Iterator[list[str]]:
+    """Words in files of the groups whose limits hold for this process: its own (version 2 and 1) and all around them.
+
+    A container sees its own group as the root.
     """
-    try:
-        lines = own.read_text().splitlines()
-    except OSError:
-        lines = []
-    found: list[Path] = []
+    lines = OWN.read_text().splitlines() if OWN.exists() else []
     for _, names, path in (line.split(":", 2) for line in ["0::/", f"0:{controller}:/", *lines] if line.count(":") > 1):
         if names and controller not in names.split(","):
             continue
-        mount = root / controller if names else root
-        group = mount / path.strip("/")
-        inside = [group, *group.parents]
-        found += inside[: inside.index(mount) + 1]
-    return found
-
-
-# How many cores this process may use: as its affinity mask and the quotas of its control groups allow.
-#
-# A container that is given two of 64 cores by a quota still sees 64: as many threads would wait for each other.
-
-
-def cores() -> int:
-    """The smaller of both numbers, at least 1."""
-    mask = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(math.ceil(min(mask, quota(ROOT, OWN))), 1)
-
-
-def quota(root: Path, own: Path) -> float:
-    """Cores' worth of time that the control groups of this process allow, infinite without a limit.
-
-    For the arguments see `control_groups.groups_around`.
-    """
-    return min((_limit(folder) for folder in groups_around("cpu", root, own)), default=math.inf)
-
-
-def _limit(folder: Path) -> float:
-    """That of one group: `cpu.max` of version 2, or the two files of version 1."""
-    try:
-        if (folder / "cpu.max").is_file():
-            allowed, period = (folder / "cpu.max").read_text().split()
-        else:
-            allowed, period = ((folder / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
-        return float(allowed) / float(period) if allowed.strip() not in ("max", "-1") else math.inf
-    except (OSError, ValueError, ZeroDivisionError):
-        return math.inf
+        mount = ROOT / controller if names else ROOT
+        inside = [group := mount / path.strip("/"), *group.parents]
+        for folder, several in product(inside[: inside.index(mount) + 1], files):
+            with suppress(OSError):  # no such group
+                yield [word for name in several for word in (folder / name).read_text().split()]
 
 
 # Freed memory is kept for the next array instead of being returned to the system.
 #
-# By default the C library maps each array of a few megabytes anew and returns it when it is freed. Then every page
-# of the
-# next one is a fault again, all threads of the process wait for each other in the kernel, and loops that make
+# By default the C library maps each array of a few megabytes anew and returns it when it is freed. Then every page of
+# the next one is a fault again, all threads of the process wait for each other in the kernel, and loops that make
 # temporaries spend a third of their time there.
 
 _TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # numbers of malloc.h
@@ -134,8 +118,7 @@ def _c_library() -> ctypes.CDLL:
 
 # Independent pieces of work in parallel, on as many threads as torch uses.
 #
-# The pieces are numba kernels that release the GIL. Idle threads sleep: unlike an OpenMP team they do not spin
-# beside
+# The pieces are numba kernels that release the GIL. Idle threads sleep: unlike an OpenMP team they do not spin beside
 # torch's own. Callers may be several threads (training, viewer) at once.
 
 T = TypeVar("T")
@@ -168,7 +151,7 @@ def one_library_thread() -> Iterator[None]:
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """The same without BLAS, for what is called often: looking for the process's BLAS libraries takes milliseconds."""
+    """Operations of torch on one thread, our loops on all, for frequent calls: finding BLAS takes milliseconds."""
     global _ours
     before, count = _ours, torch.get_num_threads()
     _ours = threads()
@@ -188,7 +171,7 @@ def torch_on_one_thread() -> None:
 
 
 def only_one_library_thread() -> None:
-    """All libraries and our loops on one thread for the rest of this process: one of several that share the cores."""
+    """Put all libraries and our loops on one thread for good, in one of several processes that share the cores."""
     torch.set_num_threads(1)
     threadpool_limits(limits=1, user_api="blas")
 
@@ -223,12 +206,12 @@ def results(tasks: Sequence[Callable[[], T]]) -> list[T]:
     numpy, torch and open3d do so while they work on large arrays.
     """
     found: dict[int, T] = {}
-    parallel([partial(_keep, found, k, task) for k, task in enumerate(tasks)])
+
+    def keep(k: int) -> None:
+        found[k] = tasks[k]()
+
+    parallel([partial(keep, k) for k in range(len(tasks))])
     return [found[k] for k in range(len(tasks))]
-
-
-def _keep(found: dict[int, T], k: int, task: Callable[[], T]) -> None:
-    found[k] = task()
 
 
 def _work(tasks: Sequence[Callable[[], object]], queue: Iterator[int], many: bool) -> None:
@@ -243,7 +226,7 @@ def _work(tasks: Sequence[Callable[[], object]], queue: Iterator[int], many: boo
 
 
 def split(n: int, parts: int, multiple: int) -> list[tuple[int, int]]:
-    """One to `parts` ranges that cover 0..n, with boundaries at multiples of `multiple`."""
+    """Make one to `parts` ranges that cover 0..n, with boundaries at multiples of `multiple`."""
     step = max(-(-n // parts), 1)
     step = -(-step // multiple) * multiple
     return [(start, min(start + step, n)) for start in range(0, max(n, 1), step)]

@@ -1,7 +1,7 @@
-"""Arrays that grow piece by piece, or are many: in memory, or in a temporary file once they are large.
+"""What is written to disk: outputs of one process alone, complete or not there at all; and arrays too large for memory.
 
-The file lies in the folder for temporary files (TMPDIR) and has no name: it is gone with the process, whatever ends it.
-The operating system keeps in memory what is used of it.
+filelock is not used: it empties the file that it locks, and so the note of what a killed process had written; it leaves
+its file in the user's folder; and it refuses file systems without locks.
 """
 
 import errno
@@ -26,7 +26,6 @@ import numpy as np
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.parallel import OWN, ROOT, groups_around, return_freed_memory
 
 # Names of the files beside an output, and the error for a place where nothing can be written.
 
@@ -52,14 +51,21 @@ def cannot_write(path: Path, error: OSError) -> UserError:
     )
 
 
-def require_possible(path: Path) -> None:
-    """Raise UserError for a path in an existing folder that can neither be found nor made: its name is too long."""
+@contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    """Errors of the system in the block are those of an output that cannot be written."""
     try:
-        os.lstat(path)
-    except FileNotFoundError:
-        pass
+        yield
+    except BlockingIOError:
+        raise
     except OSError as error:
         raise cannot_write(path, error) from error
+
+
+def require_possible(path: Path) -> None:
+    """Raise UserError for a path in an existing folder that can neither be found nor made: its name is too long."""
+    with _writing(path), suppress(FileNotFoundError):
+        os.lstat(path)
 
 
 def made_with(folder: Path) -> list[Path]:
@@ -86,8 +92,7 @@ def remove_empty(folders: Iterable[Path]) -> None:
 
 # A file that one process holds, with a note of which process that is.
 #
-# The kernel releases the file when its process ends, however it ends (flock), so one that a killed process left
-# blocks
+# The kernel releases the file when its process ends, however it ends (flock), so one that a killed process left blocks
 # nobody. Where a file system knows no locks, the note decides.
 
 _NO_LOCKS = (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS, errno.EINVAL, errno.EBADF)
@@ -110,7 +115,7 @@ class Holder:
 
     @staticmethod
     def read(note: bytes) -> "Holder | None":
-        """From a note; None if the text is none."""
+        """Read a note; None if the text is none."""
         try:
             found = json.loads(note)["sl-nerfstudio"]
             return Holder(str(found["command"]), int(found["process"]), str(found["host"]), str(found["since"]))
@@ -118,7 +123,7 @@ class Holder:
             return None
 
     def note(self) -> bytes:
-        """One line of text."""
+        """Write the note: one line of text."""
         return json.dumps({"sl-nerfstudio": vars(self)}).encode() + b"\n"
 
     def may_run(self) -> bool:
@@ -134,7 +139,7 @@ class Holder:
         return self.process != os.getpid()
 
     def __str__(self) -> str:
-        """In words."""
+        """Describe the process in words."""
         return f"{self.command} (process {self.process} on {self.host}, since {self.since})"
 
 
@@ -151,11 +156,10 @@ class LockFile:
         """
         self.path, self.output = path, output
         try:
-            self._file, locked = open_alone(path)
+            with _writing(output):
+                self._file, locked = open_alone(path)
         except BlockingIOError:
             raise in_use(output, _holder(path)) from None
-        except OSError as error:
-            raise cannot_write(output, error) from error
         try:
             self.left_by, self.lines = self._read()
             if not locked and self.left_by is not None and self.left_by.may_run():
@@ -179,20 +183,16 @@ class LockFile:
 
     def hold(self) -> None:
         """Replace what a killed process left by a note of this one."""
-        try:
+        with _writing(self.output):
             os.ftruncate(self._file, 0)
             os.lseek(self._file, 0, os.SEEK_SET)
-        except OSError as error:
-            raise cannot_write(self.output, error) from error
         self.left_by, self.lines = None, []
         self.add(Holder.here().note())
 
     def add(self, line: bytes) -> None:
         """Add a line, which ends with a newline."""
-        try:
+        with _writing(self.output):
             write_all(self._file, line)
-        except OSError as error:
-            raise cannot_write(self.output, error) from error
 
     def release(self, remove: bool = True) -> None:
         """Let others take the output."""
@@ -211,8 +211,9 @@ def open_alone(path: Path) -> tuple[int, bool]:
         file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
         try:
             locked = _lock(file)
-            if _is_at(file, path):
-                return file, locked
+            with suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file), os.lstat(path)):
+                    return file, locked
         except BaseException:
             os.close(file)
             raise
@@ -229,20 +230,11 @@ def write_all(file: int, content: bytes) -> None:
 def _lock(file: int) -> bool:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise
     except OSError as error:
-        if error.errno not in _NO_LOCKS:
+        if error.errno not in _NO_LOCKS:  # held by another process, among others
             raise
         return False
     return True
-
-
-def _is_at(file: int, path: Path) -> bool:
-    try:
-        return os.path.samestat(os.fstat(file), os.lstat(path))
-    except FileNotFoundError:
-        return False
 
 
 def _holder(path: Path) -> Holder | None:
@@ -282,7 +274,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def locked_file(path: Path) -> Iterator[None]:
-    """The same for one file; others in its folder may be outputs of other processes."""
+    """Hold one file; others in its folder may be outputs of other processes."""
     with _locked(beside(path, "sl-lock"), path, path.parent):
         yield
 
@@ -323,22 +315,20 @@ def write_atomic(path: Path, content: bytes) -> None:
     """
     temporary = beside(path, PARTIAL)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        file, _ = open_alone(temporary)
+        with _writing(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file, _ = open_alone(temporary)
     except BlockingIOError:
         raise in_use(path, None) from None
-    except OSError as error:
-        raise cannot_write(path, error) from error
     # The file stays open, and thereby locked, until it has its name: nobody else can then write into it.
     try:
-        os.ftruncate(file, 0)
-        write_all(file, content)
-        temporary.replace(path)
-    except BaseException as error:
+        with _writing(path):
+            os.ftruncate(file, 0)
+            write_all(file, content)
+            temporary.replace(path)
+    except BaseException:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise cannot_write(path, error) from error
         raise
     finally:
         os.close(file)
@@ -552,29 +542,20 @@ def _require_earlier_result(path: Path, mark: bytes) -> None:
     raise UserError(f"{path}: {problem}\n    cause:  {cause}\n    remedy: choose another output, or remove it first")
 
 
+# Arrays that grow piece by piece, or are many: in memory, or in a temporary file once they are large.
+#
+# The file lies in the folder for temporary files (TMPDIR) and has no name: it is gone with the process, whatever ends
+# it. The operating system keeps in memory what is used of it.
+
 _ALIGNMENT = 64  # bytes, of arrays in a file
 _SHARE = 8  # of the memory that this process may use, as a divisor: beyond it, an array goes to a file
-_LIMITS = ("memory.max", "memory.limit_in_bytes")  # of control groups, versions 2 and 1
 
 
 def largest_in_memory() -> int:
     """Bytes beyond which an array is kept in a file."""
+    from sl_nerfstudio.parallel import memory_of_process
+
     return memory_of_process() // _SHARE
-
-
-def memory_of_process() -> int:
-    """Bytes of memory that this process may use."""
-    return usable_memory(ROOT, OWN)
-
-
-def usable_memory(root: Path, own: Path) -> int:
-    """Bytes of memory of the machine, or fewer if the control groups of this process allow fewer.
-
-    For the arguments see `control_groups.groups_around`.
-    """
-    machine = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    files = (folder / name for folder in groups_around("memory", root, own) for name in _LIMITS)
-    return min([machine, *(limit for file in files if (limit := _limit(file)) is not None)])
 
 
 class GrowingArray:
@@ -617,11 +598,13 @@ class GrowingArray:
             raise _no_space(error, self._bytes) from error
         self._pieces = []
         if first:  # many pieces; from now on there is one at a time
+            from sl_nerfstudio.parallel import return_freed_memory
+
             return_freed_memory()
 
 
 def in_file(arrays: Sequence[ndarray]) -> list[ndarray]:
-    """The same arrays, mapped into memory from one temporary file. Raises UserError if the disk is full."""
+    """Map arrays into memory from one temporary file. Raises UserError if the disk is full."""
     firsts, end = [], 0
     for array in arrays:
         firsts.append(end)
@@ -647,10 +630,3 @@ def _no_space(error: OSError, size: int) -> UserError:
         f"    cause:  the scan is too large for the memory, and {size / 2**30:.1f} GB do not fit there\n"
         "    remedy: set TMPDIR to a folder on a disk with more space"
     )
-
-
-def _limit(file: Path) -> int | None:
-    try:
-        return int(file.read_text())
-    except (OSError, ValueError):  # no such group, or "max"
-        return None

@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from sl_nerfstudio import __main__ as environment
-from sl_nerfstudio import __version__
 from sl_nerfstudio.field.numba_backend import NumbaField
 
 
@@ -38,12 +37,6 @@ def test_everything_is_named_and_works(capsys):
     assert out["field"].startswith("torch on cpu, numba on cpu") and out["devices"].startswith("cpu (")
     assert all(f"{extra}: " in out["extras"] for extra in ("show", "phone", "video", "cuda", "las"))
     assert out["result"] == "everything needed is there"
-
-
-def test_the_first_line_names_the_version(capsys, monkeypatch):
-    monkeypatch.setattr(environment, "_shown", lambda name, part: True)
-    environment.main()
-    assert capsys.readouterr().out.startswith(f"sl_nerfstudio {__version__}, Python 3.")
 
 
 def versions(changed: dict[str, str | None]) -> Callable[[str], str]:

@@ -7,12 +7,12 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from tests.dataparser.tiny_scan import TinyScan
@@ -21,7 +21,7 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
     warnings.simplefilter("ignore")
     from nerfstudio.scripts import train as ns_train
 
-from sl_nerfstudio.methods import sl_neus, sl_neus_paper
+from sl_nerfstudio.methods import sl_neus
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio emits many warnings
 
@@ -117,6 +117,13 @@ def test_bad_scans_do_not_start(
         ({"max_num_iterations": 0}, "--max-num-iterations 0: at least 1"),
         ({"load_dir": Path("nowhere")}, "--load-dir nowhere: no checkpoint step-*.ckpt there"),
         ({"load_checkpoint": Path("none.ckpt")}, "--load-checkpoint none.ckpt: no such file"),
+        ({"machine": replace(sl_neus.config.machine, device_type="cpu", num_devices=2)}, "--machine.num-devices 2"),
+        pytest.param(
+            {"machine": replace(sl_neus.config.machine, device_type="cuda")},
+            "--machine.device-type cuda",
+            marks=pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is there"),
+        ),
+        ({"data": None}, "no scan given. Add --data FOLDER"),
     ],
 )
 def test_bad_settings_do_not_start(
@@ -130,29 +137,7 @@ def test_bad_settings_do_not_start(
     assert expected in refused(tmp_path, monkeypatch, capfd, scan, **settings)
 
 
-def test_without_a_scan(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    assert "no scan given. Add --data FOLDER" in refused(tmp_path, monkeypatch, capfd, None)
-
-
-def test_truncated_checkpoint(
-    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    checkpoint = tmp_path / "step-000000005.ckpt"
-    torch.save({"schedulers": {}, "weights": torch.zeros(1000)}, checkpoint)
-    truncate(checkpoint)
-    message = refused(tmp_path, monkeypatch, capfd, scan, load_dir=tmp_path)
-    assert "step-000000005.ckpt: cannot be read as a checkpoint" in message
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="the refusal is for machines without a GPU")
-def test_a_gpu_that_is_not_there(
-    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    machine = copy.deepcopy(sl_neus_paper.config.machine)
-    machine.device_type = "cuda"
-    assert "--machine.device-type cuda" in refused(tmp_path, monkeypatch, capfd, scan, machine=machine)
-
-
+@pytest.mark.slow
 def test_the_command_itself_refuses_a_bad_scan(tmp_path: Path) -> None:
     """The installed ns-train, in a separate process."""
     root = TinyScan(frames=2).write(tmp_path / "scan")

@@ -105,7 +105,7 @@ def _structures() -> list[Case]:
         "hidden: 10**9": lambda text: re.sub(r"hidden: \d+", "hidden: 1000000000", text),
         "log2_table_size: 60": lambda text: re.sub(r"log2_table_size: \d+", "log2_table_size: 60", text),
         "levels: -1": lambda text: re.sub(r"levels: \d+", "levels: -1", text),
-        "kappa_end: .nan": lambda text: re.sub(r"kappa_end: \S+", "kappa_end: .nan", text),
+        "eikonal: .nan": lambda text: re.sub(r"eikonal: \S+", "eikonal: .nan", text),
     }
     found = []
     for title, change in changes.items():

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import sl_nerfstudio
 from benchmarks.attacks.commands import Case, accepted, call, contents, left_behind, listing, refused, start
 from benchmarks.attacks.dying import dying
 from benchmarks.attacks.flags import CAPTURES, EVAL, EXPORT, FIXTURES, GRAY, PATTERN, PROCESS, SYNTH
-from sl_nerfstudio.processing.cache import surroundings
 from sl_nerfstudio.storage import locked, locked_file
 
 GROUP, TWO, LONG = "Killed commands", "Two commands at once", "Killed sl-process"
@@ -118,9 +118,15 @@ def _at_once(folder: Path, command: tuple[str, ...]) -> str:
     return _differs(folder, command, ("new",))
 
 
+def _code() -> str:
+    """Digest of the sources of the package: a run by other code is no reference."""
+    sources = sorted(Path(sl_nerfstudio.__file__).parent.rglob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:12]
+
+
 def prepared(folder: Path) -> Path:
     """Scan and work folder of a run that nothing stopped, made once by the same code beside the fixtures."""
-    root = folder.parents[1] / "fixtures" / f"processed-{surroundings()[:12]}"
+    root = folder.parents[1] / "fixtures" / f"processed-{_code()}"
     while not (root / "complete").exists():
         try:
             with locked(root):

@@ -14,15 +14,15 @@ from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.triangulation import epipolar_residual
 from sl_nerfstudio.object_separation.planes import DecodedFrame
 from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import (
     CoordinateNoise,
-    DeviceOptions,
     DevicePair,
     disturb_coords,
     make_devices,
     make_paths,
 )
-from sl_nerfstudio.synthesis.render import RayCaster, above_the_table, visible_points
+from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, above_the_table, visible_points
 from sl_nerfstudio.synthesis.sdf import Scene
 from sl_nerfstudio.synthesis.synthesise import make_cells
 
@@ -57,7 +57,7 @@ def make_case(scene: Scene, background: str, given: Conditions) -> Case:
     caster = RayCaster(scene, surroundings(background, scene, rng))
     poses = _poses(scene, background, given.frames, rng)
     layout = GridPattern()
-    devices = make_devices(scene, poses, (layout.w, layout.h), DeviceOptions(given.resolution))
+    devices = make_devices(scene, poses, (layout.w, layout.h), SynthConfig(resolution=given.resolution))
     camera, projector = (
         replace(d, fl_x=given.zoom * d.fl_x, fl_y=given.zoom * d.fl_y) for d in (devices.camera, devices.projector)
     )
@@ -67,7 +67,7 @@ def make_case(scene: Scene, background: str, given: Conditions) -> Case:
     uv = np.stack(np.meshgrid(np.arange(camera.w), np.arange(camera.h)), -1).reshape(-1, 2) + 0.5
     frames, objects = [], []
     for T_c, T_p in zip(poses.T_world_camera, poses.T_world_projector, strict=True):
-        found = visible_points(caster, devices, T_c, T_p, uv)
+        found = visible_points(FrameGeometry(caster, devices, T_c, T_p), uv)
         mask = found.lit.reshape(camera.h, camera.w)
         exact = np.where(mask[..., None], found.uv_projector.reshape(*mask.shape, 2), np.nan).astype(np.float32)
         exact_frame = DecodedFrame(camera, projector, T_c, T_p, disturb_coords(exact, mask, cells, noise, rng), mask)

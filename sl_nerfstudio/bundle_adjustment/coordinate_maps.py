@@ -481,8 +481,8 @@ class CoordinateMaps:
         for f, (first, last) in enumerate(pairwise(groups.first.tolist())):
             mine = groups.entries[first:last]
             if len(mine):
-                steps = distance_transform_cdt(np.pad(self.index.known(f), 1), "chessboard")[1:-1, 1:-1].ravel()
-                found[mine] = np.where(pixel[mine] >= 0, np.minimum(steps[pixel[mine]], FARTHEST), 0)
+                steps = np.asarray(distance_transform_cdt(np.pad(self.index.known(f), 1), "chessboard"))[1:-1, 1:-1]
+                found[mine] = np.where(pixel[mine] >= 0, np.minimum(steps.ravel()[pixel[mine]], FARTHEST), 0)
         return torch.from_numpy(found)
 
     def look_up(

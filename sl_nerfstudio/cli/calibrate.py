@@ -113,7 +113,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class CalibrationInputs:
-    """Everything a calibration starts from."""
+    """What a calibration starts from."""
 
     captures: "BoardCaptures"
     camera_size: Size
@@ -168,7 +168,7 @@ def _content(config: CalibrateConfig) -> list[Any]:
 
 
 def _decoder(config: CalibrateConfig, found: "Captures") -> "Decoder[Any]":
-    """For the pattern that was projected."""
+    """Choose the decoder of the pattern that was projected."""
     from sl_nerfstudio.decoding.decoders import choose_decoder
     from sl_nerfstudio.processing.captures import layout_in_order, likely_layout, recognise_sequence, resolution
 

@@ -142,6 +142,7 @@ def say(text: str) -> None:
 
 def capture(config: CaptureConfig) -> None:
     """Capture until it is ended, then say what to do next. Raises UserError for what cannot be captured."""
+    config.check()
     from sl_nerfstudio.capture.camera import open_camera
     from sl_nerfstudio.pattern.files import read_layout
     from sl_nerfstudio.pattern.gray_code import GrayCode
@@ -261,14 +262,7 @@ def _next_command(config: CaptureConfig) -> str:
 
 def main() -> None:
     """Entry point of the command."""
-    run(_capture)
-
-
-def _capture() -> None:
-    config = tyro.cli(CaptureConfig, prog="sl-capture", config=(tyro.conf.FlagCreatePairsOff,))
-    config.check()
-
-    capture(config)
+    run(lambda: capture(tyro.cli(CaptureConfig, prog="sl-capture", config=(tyro.conf.FlagCreatePairsOff,))))
 
 
 if __name__ == "__main__":

@@ -99,7 +99,7 @@ def agreement(result: "FolderCheck", cross: "CrossFrameAgreement", shared_decode
     from sl_nerfstudio.review.verdict import FrameFacts, ScanFacts, judge_scan
 
     frames = tuple(
-        FrameFacts(content.name, decoded_share=content.decoded, shared_decoded=shared)
+        FrameFacts(content.name, decode_rate=content.decoded, shared_decoded=shared)
         for content, shared in zip(result.contents, shared_decoded, strict=True)
     )
     verdict = judge_scan(ScanFacts(frames, cross=cross))

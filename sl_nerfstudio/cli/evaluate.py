@@ -56,7 +56,7 @@ def _listed(name: str, lines: Sequence[str], rest: str) -> list[str]:
 
 
 def _surface(evaluation: "Evaluation", sigma: "Sequence[PoseSigma | None]") -> str:
-    """Its distance from the truth, or else how well the poses are known."""
+    """Say how far it is from the truth, or else how well the poses are known."""
     from sl_nerfstudio.evaluation.judgement import ALIGNED
 
     if evaluation.alignment in evaluation.surface:
@@ -269,7 +269,7 @@ def _evaluate(config: EvalConfig) -> None:
 
 
 def _next_capture(evaluation: "Evaluation", inputs: "EvaluationInputs") -> "NextView | None":
-    from sl_nerfstudio.evaluation.completeness import SurfaceView, next_view
+    from sl_nerfstudio.evaluation.completeness import CaptureView, next_view
     from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 
     found = evaluation.completeness
@@ -277,7 +277,7 @@ def _next_capture(evaluation: "Evaluation", inputs: "EvaluationInputs") -> "Next
         return None
     poses = zip(inputs.poses.T_world_camera, inputs.poses.T_world_projector, strict=True)
     frames = [
-        SurfaceView(frame.camera, T_c, inputs.scan.projector, T_p)
+        CaptureView(frame.camera, T_c, inputs.scan.projector, T_p)
         for frame, (T_c, T_p) in zip(inputs.scan.frames, poses, strict=True)
     ]
     return next_view(IndexedMesh(inputs.mesh), found.openings, frames, found.noise_px)

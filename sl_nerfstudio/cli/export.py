@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.cli.run import load_run, run
 from sl_nerfstudio.console import command, fitted, next_steps, short_path, unit_word
 from sl_nerfstudio.errors import UserError
 
@@ -264,7 +264,7 @@ def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
 
 
 def _next(config: ExportConfig, scan: "Scan", exported: "Exported") -> list[str]:
-    """How to judge the mesh. It fits the captures only from the poses with which it was trained."""
+    """Say how to judge the mesh. It fits the captures only from the poses with which it was trained."""
     if config.watertight or config.keep_unobserved:
         flag = "--watertight" if config.watertight else "--keep-unobserved"
         return [fitted(f"to judge the surface with sl-eval, export it without {flag}: it judges what is invented, too")]
@@ -419,7 +419,7 @@ def _texture_words(textured: "Textured", unit: str) -> list[str]:
 
 
 def _uncertainty(quality: "VertexQuality", unit: str) -> list[str]:
-    """How well the surface is known, and how much of it is not."""
+    """Say how well the surface is known, and how much of it is not."""
     import numpy as np
 
     sigma = quality.sigma[quality.views > 0]
@@ -483,8 +483,6 @@ def export(config: ExportConfig) -> None:
         if config.pose_folder is not None:
             held.enter_context(locked(config.pose_folder))
         check_outputs(config)  # again: a process that held them until now may have written them
-        from sl_nerfstudio.runs.run import load_run
-
         print(export_trained(load_run(config.load_config, config.data), config))
 
 

@@ -88,20 +88,12 @@ def margin_warning(grid: "GridPattern") -> str:
     )
 
 
-def write_board(
-    output: Path,
-    print_width: float | None,
-    kind: str,
-    size: str | None,
-    square: str | None,
-    marker: str | None,
-    dictionary: str | None,
-) -> str:
+def write_board(arguments: "PatternArguments") -> str:
     """A calibration board in true size; returns what to say. Raises UserError for boards that cannot be."""
     from sl_nerfstudio.pattern.boards import description, encode_board, lay_out
     from sl_nerfstudio.storage import NewFolder
 
-    board = _board(print_width, kind, size or _DEFAULT_COUNTS[kind], square, marker, dictionary)
+    board, output = _board(arguments), arguments.output
     with NewFolder(output) as folder:
         try:
             laid_out = lay_out(board)
@@ -137,25 +129,25 @@ def calibrate_command(board: "Board") -> str:
     return " ".join(["sl-calibrate", "--images", "captures", *flags, *lengths, *end])
 
 
-def _board(
-    print_width: float | None, kind: str, size: str, square: str | None, marker: str | None, dictionary: str | None
-) -> "Board":
+def _board(arguments: "PatternArguments") -> "Board":
     from sl_nerfstudio.pattern.boards import CharucoBoard, Chessboard, counts, millimetres
 
+    a, kind = arguments, arguments.shown_kind
+    size = a.corners or a.squares or _DEFAULT_COUNTS[kind]
     columns, rows = counts(size, "--corners" if kind == "chessboard" else "--squares")
     across = columns + 1 if kind == "chessboard" else columns
-    if (print_width is None) == (square is None):
+    if (a.print_width is None) == (a.square is None):
         raise UserError(
             f"--kind {kind}: give either --print-width, the width of all {across} squares together in millimetres, or "
             '--square, the side of one of them with its unit ("18 mm"); --print-width 180 suits A4 paper'
         )
-    side = print_width / max(across, 1) if print_width is not None else millimetres(square or "", "--square")
+    side = a.print_width / max(across, 1) if a.print_width is not None else millimetres(a.square or "", "--square")
     side = _rounded(side)
     try:
         if kind == "chessboard":
             return Chessboard(columns, rows, side)
-        markers = millimetres(marker, "--marker") if marker is not None else _MARKER * side
-        return CharucoBoard(columns, rows, side, _rounded(markers), dictionary or _DEFAULT_DICTIONARY)
+        markers = millimetres(a.marker, "--marker") if a.marker is not None else _MARKER * side
+        return CharucoBoard(columns, rows, side, _rounded(markers), a.dictionary or _DEFAULT_DICTIONARY)
     except ValueError as error:
         raise UserError(f"--kind {kind}: {error}") from error
 
@@ -289,16 +281,12 @@ def main() -> None:
 
 
 def _write() -> None:
-    from sl_nerfstudio.pattern.boards import counts
-
     arguments = tyro.cli(PatternArguments, prog="sl-pattern")
     _check(arguments)
     if arguments.show is not None:
         _show(arguments, arguments.show)
     elif arguments.is_board:
-        a = arguments
-        counts = a.corners or a.squares
-        print(write_board(a.output, a.print_width, a.shown_kind, counts, a.square, a.marker, a.dictionary))
+        print(write_board(arguments))
     else:
         print(write_pattern(arguments.output, _layout(arguments), arguments.print_width))
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import tyro
 
-from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.cli.run import load_run, run
 from sl_nerfstudio.console import command, next_steps
 from sl_nerfstudio.errors import UserError
 
@@ -43,8 +43,6 @@ def main() -> None:
 def redecode(arguments: RedecodeArguments) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     check(arguments)
-    from sl_nerfstudio.runs.run import load_run
-
     print(redecode_trained(load_run(arguments.load_config, arguments.data), arguments))
 
 
@@ -59,9 +57,9 @@ def check(arguments: RedecodeArguments) -> None:
 
 def redecode_trained(trained: "TrainedRun", arguments: RedecodeArguments) -> str:
     """Decode the scan of a loaded run again; returns the summary to print."""
-    from sl_nerfstudio.redecoding.redecode import RedecodeSettings, redecode_run
+    from sl_nerfstudio.redecoding.redecode import redecode_run
 
-    found = redecode_run(trained, RedecodeSettings(arguments.output, arguments.resolution))
+    found = redecode_run(trained, arguments.output, arguments.resolution)
     return summary(arguments.output, trained.config.method_name, found)
 
 

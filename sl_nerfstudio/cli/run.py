@@ -1,4 +1,4 @@
-"""How every command of the package ends: faults that a user can correct are shown without a traceback."""
+"""What commands share: how they end, without a traceback for what a user can correct, and loading a training run."""
 
 import os
 import signal
@@ -7,9 +7,14 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from io import TextIOWrapper
+from pathlib import Path
 from types import FrameType
+from typing import TYPE_CHECKING
 
 from sl_nerfstudio.errors import UserError
+
+if TYPE_CHECKING:
+    from sl_nerfstudio.runs.run import TrainedRun
 
 EXIT_FAULT = 1
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells expect
@@ -64,7 +69,16 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def _ignore_more_signals() -> None:
-    """Everything is cleaned up: a second control-C must not print a traceback while Python ends."""
+    """Keep a second control-C from printing a traceback while Python ends: everything is cleaned up."""
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.SIG_IGN)
+
+
+def load_run(config: Path, data: Path | None) -> "TrainedRun":
+    """`runs.run.load_run`; nerfstudio is imported for it without torch's compiler, which takes seconds."""
+    from sl_nerfstudio.late_imports import compiler_on_demand
+
+    with compiler_on_demand():
+        from sl_nerfstudio.runs import run as runs
+    return runs.load_run(config, data)

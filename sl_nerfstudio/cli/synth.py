@@ -45,7 +45,7 @@ def _synthesise() -> None:
 
 
 def _next(output: Path, config: SynthConfig) -> str:
-    """How to go on with what was made."""
+    """Say how to go on with what was made."""
     if not config.images_only:
         return next_steps([command("ns-train", "sl-neus", "--data", output)])
     pattern = output / "pattern.json"

@@ -4,7 +4,7 @@ What `frame_pixels` predicts is compared with the decoded coordinates and, looke
 pattern image.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from scipy.ndimage import binary_opening, label, map_coordinates
 
+from sl_nerfstudio.console import track
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.lie import DevicePoses, inverse, transform
@@ -78,7 +79,7 @@ def frame_pixels(
     T_world_projector: Float[ndarray, "4 4"],
     max_pixels: int = MAX_PIXELS,
 ) -> FramePixels:
-    """Everything that the figures and pictures of one frame need; reads the files of the frame."""
+    """Evaluate the pixels of a frame, whose files this reads, for figures and pictures."""
     mask, coords, captured = frame.read_mask(), frame.read_coords(), frame.read_pattern()
     stride = max(1, int(np.ceil(np.sqrt(mask.sum() / max_pixels))))
     row, column = np.nonzero(mask[::stride, ::stride])
@@ -100,7 +101,7 @@ def frame_pixels(
     meeting = triangulate(camera, T_c, uv, projector, T_p, torch.as_tensor(np.nan_to_num(predicted)))
     to_projector = T_world_projector[:3, 3] - p_world
     cosine = -(to_projector * direction).sum(1) / np.linalg.norm(to_projector, axis=1)
-    footprint = _footprint(coords)
+    footprint = _median(np.linalg.norm(np.diff(coords, axis=1), axis=2).ravel())
     return FramePixels(
         row=row,
         column=column,
@@ -116,7 +117,7 @@ def frame_pixels(
         depth_per_px=np.where(reached, meeting.sigma_depth.numpy(), np.nan),
         ray_angle_deg=np.degrees(np.arccos(np.clip(cosine, -1, 1))),
         behind=np.where(np.isfinite(decoded_uv).all(1), hits.distance - measured, np.nan),
-        noise_px=float(np.nan_to_num(max(MAD_TO_SIGMA * _known_median(np.abs(epipolar)), _FOOTPRINT * footprint))),
+        noise_px=float(np.nan_to_num(max(MAD_TO_SIGMA * _median(np.abs(epipolar)), _FOOTPRINT * footprint))),
         footprint_px=footprint,
     )
 
@@ -140,12 +141,6 @@ def _predict(
     return np.where(in_front.numpy()[:, None], uv, np.nan), reached
 
 
-def _footprint(coords: Float[ndarray, "h w 2"]) -> float:
-    """Pattern pixels between the coordinates of neighbouring camera pixels; NaN where there are none."""
-    step = np.linalg.norm(np.diff(coords, axis=1), axis=2)
-    return _known_median(step.ravel())
-
-
 def look_up(image: Float[ndarray, "h w"], uv: Float[ndarray, "n 2"]) -> Float[ndarray, "n"]:
     """Bilinear value of an image at pixels `uv` (centre of the first pixel: 0.5); NaN for NaN."""
     out = np.full(len(uv), np.nan)
@@ -155,16 +150,9 @@ def look_up(image: Float[ndarray, "h w"], uv: Float[ndarray, "n 2"]) -> Float[nd
     return out
 
 
-def _known_median(values: Float[ndarray, "n"]) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else float("nan")
-
-
 # Holes of a mesh: places that a frame decoded and whose rays meet no surface there.
 
-_LEAST_DEPTH = (
-    0.01  # of the mesh's size, by which a ray must pass the measured point for the surface to be missing there
-)
+_LEAST_DEPTH = 0.01  # of the mesh's size: how far behind the measured point a ray must pass where surface is missing
 _LEAST_WIDTH = 0.02  # of the side of a square as large as the decoded area: narrower gaps are rims of the surface
 
 _JUMP = 2.5  # usual steps between neighbouring pixels, beyond which coordinates jump
@@ -291,70 +279,51 @@ def frame_agreement(name: str, masked: int, pixels: FramePixels, holes: Holes) -
     )
 
 
-class AgreementAccumulator:
-    """Collects frames one by one; keeps the residuals (float32), not the images."""
-
-    def __init__(self) -> None:
-        self._frames: list[FrameAgreement] = []
-        self._coordinate: list[ndarray] = []
-        self._epipolar: list[ndarray] = []
-        self._depth: list[ndarray] = []
-        self._products = np.zeros(3)
-
-    def add(self, figures: FrameAgreement, pixels: FramePixels) -> None:
-        """Add one more frame."""
-        self._frames.append(figures)
-        self._coordinate.append(_known(pixels.coordinate))
-        self._epipolar.append(_known(np.abs(pixels.epipolar)))
-        self._depth.append(_known(pixels.depth_per_px))
-        both = pixels.lit & np.isfinite(pixels.rendered)
-        a, b = pixels.captured[both], pixels.rendered[both]
-        self._products += (float(a @ b), float(a @ a), float(b @ b))
-
-    def result(self) -> CaptureAgreement:
-        """Figures over all pixels of all frames added."""
-        coordinate = np.concatenate(self._coordinate)
-        ab, aa, bb = self._products
-        weight = np.array([f.pixels for f in self._frames], np.float64)
-        return CaptureAgreement(
-            coordinate_px_median=_median(coordinate),
-            coordinate_px_p95=_percentile(coordinate, 95.0),
-            epipolar_px_median=_median(np.concatenate(self._epipolar)),
-            pattern_cosine=float(ab / np.sqrt(aa * bb)) if aa * bb > 0 else float("nan"),
-            hit_share=float(np.average([f.hit_share for f in self._frames], weights=weight)) if weight.sum() else 0.0,
-            depth_per_px=_median(np.concatenate(self._depth)),
-            ray_angle_deg=_median(np.array([f.ray_angle_deg for f in self._frames])),
-            frames=tuple(self._frames),
-        )
-
-
 def compare_captures(
     surface: IndexedMesh,
     scan: Scan,
     poses: DevicePoses,
-) -> Iterator[tuple[Frame, FrameAgreement, FramePixels]]:
-    """Figures and pixels of every frame in turn; as many frames are in memory at a time as there are threads."""
-    pattern = scan.read_pattern()
-    tasks = [
-        partial(_compare, surface, scan, pattern, frame, T_c, T_p)
-        for frame, T_c, T_p in zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
-    ]
-    for first in range(0, len(tasks), threads()):
-        yield from results(tasks[first : first + threads()])
+    on_frame: Callable[[Frame, FrameAgreement, FramePixels], None] | None = None,
+) -> CaptureAgreement:
+    """Figures of all frames; `on_frame` is called with each of them and its pixels in turn (to make pictures).
 
+    As many frames are in memory at a time as there are threads; their residuals are kept, in float32.
+    """
+    pattern, most = scan.read_pattern(), most_pixels(len(scan.frames))
 
-def _compare(
-    surface: IndexedMesh,
-    scan: Scan,
-    pattern: Float[ndarray, "ph pw"],
-    frame: Frame,
-    T_world_camera: Float[ndarray, "4 4"],
-    T_world_projector: Float[ndarray, "4 4"],
-) -> tuple[Frame, FrameAgreement, FramePixels]:
-    most = most_pixels(len(scan.frames))
-    pixels = frame_pixels(surface, frame, scan, pattern, T_world_camera, T_world_projector, most)
-    masked, holes = len(pixels.row) * pixels.stride**2, find_holes(pixels, surface.diagonal)
-    return frame, frame_agreement(frame.name, masked, pixels, holes), pixels
+    def compare(frame: Frame, *poses: Float[ndarray, "4 4"]) -> tuple[Frame, FrameAgreement, FramePixels]:
+        pixels = frame_pixels(surface, frame, scan, pattern, *poses, max_pixels=most)
+        masked, holes = len(pixels.row) * pixels.stride**2, find_holes(pixels, surface.diagonal)
+        return frame, frame_agreement(frame.name, masked, pixels, holes), pixels
+
+    every = zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
+    tasks = [partial(compare, *one) for one in every]
+    batches = (results(tasks[first : first + threads()]) for first in range(0, len(tasks), threads()))
+    frames: list[FrameAgreement] = []
+    coordinate, epipolar, depth, products = [], [], [], np.zeros(3)
+    found = (one for batch in batches for one in batch)
+    for frame, figures, pixels in track(found, "ray casting the frames", total=len(scan.frames)):
+        frames.append(figures)
+        coordinate.append(_known(pixels.coordinate))
+        epipolar.append(_known(np.abs(pixels.epipolar)))
+        depth.append(_known(pixels.depth_per_px))
+        both = pixels.lit & np.isfinite(pixels.rendered)
+        a, b = pixels.captured[both], pixels.rendered[both]
+        products += (float(a @ b), float(a @ a), float(b @ b))
+        if on_frame is not None:
+            on_frame(frame, figures, pixels)
+    ab, aa, bb = products
+    weight = np.array([f.pixels for f in frames], np.float64)
+    return CaptureAgreement(
+        coordinate_px_median=_median(np.concatenate(coordinate)),
+        coordinate_px_p95=_percentile(np.concatenate(coordinate), 95.0),
+        epipolar_px_median=_median(np.concatenate(epipolar)),
+        pattern_cosine=float(ab / np.sqrt(aa * bb)) if aa * bb > 0 else float("nan"),
+        hit_share=float(np.average([f.hit_share for f in frames], weights=weight)) if weight.sum() else 0.0,
+        depth_per_px=_median(np.concatenate(depth)),
+        ray_angle_deg=_median(np.array([f.ray_angle_deg for f in frames])),
+        frames=tuple(frames),
+    )
 
 
 def _known(values: Float[ndarray, "n"]) -> Float[ndarray, "m"]:

@@ -1,19 +1,19 @@
-"""How complete a surface is: of what the frames decoded, and where it ends."""
+"""How complete a surface is of what the frames decoded, where it ends, and which capture would add most."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from sl_nerfstudio.console import track
 from sl_nerfstudio.evaluation.agreement import CaptureAgreement
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh, faces_and_falls_inside
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.lie import DevicePoses, inverse, transform
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, component_labels
+from sl_nerfstudio.geometry.triangulation import world_pixels
 from sl_nerfstudio.meshing.mesh import Mesh
 
 # Openings of a mesh: where its surface ends. Every real object is closed, so behind each of them something lacks.
@@ -42,7 +42,7 @@ class Openings:
 
 
 def find_openings(mesh: Mesh) -> Openings:
-    """All borders of the mesh; those that meet in a vertex count as one."""
+    """Find all borders of the mesh; those that meet in a vertex count as one."""
     start, end = _border(mesh)
     label = component_labels(start, end, len(mesh.vertices))[start]
     _, label = np.unique(label, return_inverse=True)
@@ -138,7 +138,7 @@ _SEED = 0
 
 
 @dataclass(frozen=True)
-class SurfaceView:
+class CaptureView:
     """A camera with its projector, anywhere."""
 
     camera: Device
@@ -198,7 +198,7 @@ def places(surface: IndexedMesh, openings: Openings, count: int) -> Places:
     )
 
 
-def information(at: Places, occluders: Occluders, view: SurfaceView, noise_px: float) -> Float[ndarray, "n"]:
+def information(at: Places, occluders: Occluders, view: CaptureView, noise_px: float) -> Float[ndarray, "n"]:
     """What a view adds to the knowledge of each place along its normal, 1 / length^2; 0 where it does not see it."""
     index = np.arange(len(at.points))
     for device, T in ((view.camera, view.T_world_camera), (view.projector, view.T_world_projector)):
@@ -212,7 +212,7 @@ def information(at: Places, occluders: Occluders, view: SurfaceView, noise_px: f
     return out
 
 
-def known(at: Places, occluders: Occluders, views: Sequence[SurfaceView], noise_px: float) -> Float[ndarray, "n"]:
+def known(at: Places, occluders: Occluders, views: Sequence[CaptureView], noise_px: float) -> Float[ndarray, "n"]:
     """Information about each place from all views and from the size of what is not seen."""
     total = 1 / at.doubt**2
     for view in views:
@@ -220,17 +220,12 @@ def known(at: Places, occluders: Occluders, views: Sequence[SurfaceView], noise_
     return total
 
 
-def _pattern_px_per_length(points: Float[ndarray, "n 3"], view: SurfaceView) -> Float[ndarray, "n"]:
-    """How far the pattern moves under a point that moves along its camera ray."""
+def _pattern_px_per_length(points: Float[ndarray, "n 3"], view: CaptureView) -> Float[ndarray, "n"]:
+    """Measure how far the pattern moves under a point that moves along its camera ray."""
     eye = view.T_world_camera[:3, 3]
     step = 1e-4 * (points - eye)
-    uv = [_project(points + side * step, view) for side in (-0.5, 0.5)]
+    uv = [world_pixels(view.projector, view.T_world_projector, points + side * step)[0] for side in (-0.5, 0.5)]
     return np.linalg.norm(uv[1] - uv[0], axis=1) / np.linalg.norm(step, axis=1)
-
-
-def _project(points: Float[ndarray, "n 3"], view: SurfaceView) -> Float[ndarray, "n 2"]:
-    T = inverse(torch.as_tensor(view.T_world_projector, dtype=torch.float64))
-    return project(Intrinsics.of(view.projector, torch.float64), transform(T, torch.from_numpy(points)))[0].numpy()
 
 
 def _cosine(
@@ -249,7 +244,7 @@ _UPRIGHT = 0.5  # length of the mean of all cameras' upward axes from which ther
 
 @dataclass(frozen=True)
 class NextView:
-    """Where to capture next; lengths in the scan's unit."""
+    """The capture that would add most; lengths in the scan's unit."""
 
     T_world_camera: Float[ndarray, "4 4"]
     T_world_projector: Float[ndarray, "4 4"]
@@ -263,7 +258,7 @@ class NextView:
 
 
 def next_view(
-    surface: IndexedMesh, openings: Openings, frames: Sequence[SurfaceView], noise_px: float
+    surface: IndexedMesh, openings: Openings, frames: Sequence[CaptureView], noise_px: float
 ) -> NextView | None:
     """The best of some hundred views as far away as the frames are; None if none would add anything.
 
@@ -286,7 +281,7 @@ def next_view(
 
 
 def _described(
-    view: SurfaceView, added: Float[ndarray, "n"], removed: float, at: Places, before: Float[ndarray, "n"],
+    view: CaptureView, added: Float[ndarray, "n"], removed: float, at: Places, before: Float[ndarray, "n"],
     surface: IndexedMesh, poses: DevicePoses,
 ) -> NextView:  # fmt: skip
     unseen = before <= 1 / at.doubt**2
@@ -312,8 +307,8 @@ def _described(
 
 
 def _candidates(
-    surface: IndexedMesh, openings: Openings, frames: Sequence[SurfaceView], poses: DevicePoses
-) -> Iterator[SurfaceView]:
+    surface: IndexedMesh, openings: Openings, frames: Sequence[CaptureView], poses: DevicePoses
+) -> Iterator[CaptureView]:
     """Views from directions all around and from in front of the openings, each turned about its axis in four ways."""
     positions = poses.T_world_camera[:, :3, 3]
     distance = float(np.median(np.linalg.norm(positions - surface.centre, axis=1)))
@@ -327,7 +322,7 @@ def _candidates(
         for turn in range(_TURNS):
             T = _looking_at(surface.centre, direction, distance, turn * 2 * np.pi / _TURNS)
             at_projector = frames[usual].T_world_projector if still else T @ relative
-            yield SurfaceView(frames[usual].camera, T, frames[usual].projector, at_projector)
+            yield CaptureView(frames[usual].camera, T, frames[usual].projector, at_projector)
 
 
 def _looking_at(

@@ -12,10 +12,8 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
-from sl_nerfstudio.console import track
 from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.evaluation.agreement import (
-    AgreementAccumulator,
     CaptureAgreement,
     FrameAgreement,
     FramePixels,
@@ -177,6 +175,8 @@ def read_inputs(
     result = read_mesh(mesh, scan.units)
     truth = read_ground_truth(scan)
     path = poses / TRANSFORMS if poses and poses.is_dir() else poses
+    training = None if path is None else path.with_name("training.json")
+    quality = read_quality(mesh)
     evaluated = scan.poses if path is None else read_refined_poses(path, scan)
     scan = scan if path is None else read_devices(path, scan)
     return EvaluationInputs(
@@ -189,15 +189,10 @@ def read_inputs(
         poses_path=path,
         pose_sigma=[] if path is None else read_pose_sigmas(path, scan),
         unplaced=[] if path is None else read_unplaced(path, scan),
-        training=None if path is None else _read_training(path.with_name("training.json")),
-        quality=_read_quality(mesh, result),
+        training=read_document(training) if training is not None and training.exists() else None,
+        quality=quality if quality is not None and len(quality.sigma) == len(result.vertices) else None,
         joint=None if path is None else read_covariance(path.parent, scan),
     )
-
-
-def _read_quality(path: Path, mesh: Mesh) -> VertexQuality | None:
-    quality = read_quality(path)
-    return quality if quality is not None and len(quality.sigma) == len(mesh.vertices) else None
 
 
 def read_refined_poses(path: Path, scan: Scan) -> DevicePoses:
@@ -215,10 +210,6 @@ def _of_another_scan(path: Path, problem: str) -> FileError:
     return FileError(
         path, problem, "the poses are those of another scan", "give poses that were refined from this scan"
     )
-
-
-def _read_training(path: Path) -> dict[str, Any] | None:
-    return read_document(path) if path.exists() else None
 
 
 def read_reference(path: Path | None, scan: Scan, poses: DevicePoses, samples: int, seed: int) -> Reference | None:
@@ -326,7 +317,9 @@ def evaluate(
     surface of this scan.
     """
     surface = IndexedMesh(mesh)
-    agreement = _agreement(surface, scan, poses, on_frame)
+    agreement = compare_captures(surface, scan, poses, on_frame)
+    if not any(frame.hit_share > 0 for frame in agreement.frames):
+        raise UserError(_missed(surface, scan, poses))
     initial = scan.poses
     moved = not np.array_equal(initial.stacked(), poses.stacked())
     scores: dict[str, SurfaceScore] = {}
@@ -383,31 +376,13 @@ def _starts(
     points: Float[ndarray, "n 3"],
     tolerance: float,
 ) -> list[Similarity]:
-    """Where ICP starts from; a single start if the poses say that the result is already in place."""
+    """Choose where ICP starts from; a single start if the poses say that the result is already in place."""
     identity = Similarity.identity()
     if poses is None or true_poses is None:
         return [identity]
     by_poses = align_poses(poses.stacked(), true_poses.stacked(), with_scale)
     apart = np.abs(by_poses.points(points) - points).max() > tolerance
     return [identity, by_poses] if apart else [identity]
-
-
-def _agreement(
-    surface: IndexedMesh,
-    scan: Scan,
-    poses: DevicePoses,
-    on_frame: Callable[[Frame, FrameAgreement, FramePixels], None] | None,
-) -> CaptureAgreement:
-    total = AgreementAccumulator()
-    frames = compare_captures(surface, scan, poses)
-    for frame, figures, pixels in track(frames, "ray casting the frames", total=len(scan.frames)):
-        total.add(figures, pixels)
-        if on_frame is not None:
-            on_frame(frame, figures, pixels)
-    result = total.result()
-    if not any(frame.hit_share > 0 for frame in result.frames):
-        raise UserError(_missed(surface, scan, poses))
-    return result
 
 
 def _missed(surface: IndexedMesh, scan: Scan, poses: DevicePoses) -> str:

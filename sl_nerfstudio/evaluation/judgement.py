@@ -96,7 +96,7 @@ class TrainedSteps:
 
 
 def trained_steps(training: dict[str, Any] | None) -> TrainedSteps | None:
-    """From a training.json; None if it does not say."""
+    """Read the steps from a training.json; None if it does not say."""
     settings = (training or {}).get("settings")
     if not isinstance(settings, dict):
         return None
@@ -126,11 +126,15 @@ _STEEP_DEG = 60.0  # above or below the horizon
 
 
 def disagreeing_frames(evaluation: Evaluation) -> tuple[str, ...]:
-    """At most one sentence, with all frames that contradict the others or the surface; none with starting poses."""
+    """Name all frames that contradict the others or the surface, in one sentence; none with starting poses."""
     if evaluation.starting_poses:
         return ()
     frames = evaluation.agreement.frames
-    names = [f.name for k, f in enumerate(frames) if _stands_out(f, frames) or _contradicts(evaluation, k)]
+    bad = {f.name for f in frames if _stands_out(f, frames)}
+    if evaluation.cross is not None and evaluation.cross.pairs:
+        judged = zip(frames, evaluation.cross.frames, strict=True)
+        bad |= {f.name for f, one in judged if frame_band(one) != "good"}
+    names = [f.name for f in frames if f.name in bad]
     if not names or len(names) > _MOST * len(frames):
         return ()
     several = len(names) > 1
@@ -146,13 +150,8 @@ def _stands_out(frame: FrameAgreement, frames: tuple[FrameAgreement, ...]) -> bo
     return frame.agreeing_share < _LEAST_AGREEING
 
 
-def _contradicts(evaluation: Evaluation, number: int) -> bool:
-    cross = evaluation.cross
-    return cross is not None and bool(cross.pairs) and frame_band(cross.frames[number]) != "good"
-
-
 def capture_next(evaluation: Evaluation, view: NextView | None) -> str:
-    """Where to capture next and what that would show; "" if nothing that no frame has seen would show."""
+    """Say where to capture next and what that would show; "" if nothing that no frame has seen would show."""
     found = evaluation.completeness
     if found is None or view is None:
         return ""

@@ -1,4 +1,4 @@
-"""Which points of a true surface a scan could observe."""
+"""A mesh with a search tree: nearest points, ray hits, samples, and which of its points a scan could observe."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
@@ -82,9 +82,6 @@ def thin(corners: Float[ndarray, "f 3 3"]) -> Bool[ndarray, "f"]:
     longest2 = ((np.roll(corners, -1, axis=1) - corners) ** 2).sum(2).max(1)
     doubled = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     return doubled < _THIN * longest2
-
-
-# A triangle mesh with a search tree: nearest points, ray hits, occlusion, evenly spread samples.
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a result is compared with: a true mesh, or reference points."""
+"""What a result is compared with, a true mesh or reference points; alignment with it, and errors of poses."""
 
 from dataclasses import dataclass
 
@@ -211,7 +211,7 @@ class MeshReference:
         return self.surface.distance(points)
 
     def signed_distance(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-        """The same, negative behind the nearest triangle (inside the object)."""
+        """Distance from the nearest point on the triangles, negative behind it (inside the object)."""
         near = self.surface.closest(points)
         behind = ((points - near.point) * near.normal).sum(1) < 0
         return np.where(behind, -near.distance, near.distance)
@@ -302,5 +302,5 @@ def mesh_reference(mesh: Mesh, scan: Scan, poses: DevicePoses, samples: int = 10
 
 
 def _thinned(points: Float[ndarray, "n 3"]) -> Float[ndarray, "m 3"]:
-    """At most `_ICP_POINTS` of the points, evenly spaced."""
+    """Keep at most `_ICP_POINTS` of the points, evenly spaced."""
     return points[:: max(1, -(-len(points) // _ICP_POINTS))]

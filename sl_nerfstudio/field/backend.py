@@ -17,7 +17,6 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.autograd.graph import get_gradient_edge
 
-from sl_nerfstudio.field.hash_grid import GridLayout
 from sl_nerfstudio.field.numba_grid import LIST, clear
 from sl_nerfstudio.parallel import parallel, split
 
@@ -105,18 +104,6 @@ class TableGradient:
             self.marks.fill_(1)
             self._version = self.buffer._version
         return self.marks
-
-    def put(self, marks: Tensor, rows: Tensor, values: Tensor) -> None:
-        """Replace rows; `marks` are those of all rows that may not be zero from now on."""
-        self.buffer[rows] = values
-        self.marks.copy_(marks)
-        self._version = self.buffer._version
-
-    def move(self, buffer: Tensor, marks: Tensor) -> None:
-        """Continue in other memory, of the same shapes; the table's `grad` must be set to it by the caller."""
-        buffer.copy_(self.buffer)
-        marks.copy_(self.trusted_marks())
-        self.buffer, self.marks, self._version = buffer, marks, buffer._version
 
     def clear(self) -> None:
         """Set the buffer to zero."""
@@ -233,23 +220,19 @@ class MergedBackend(Protocol):
         ...
 
 
-def numba_cannot(layout: GridLayout, table: Tensor) -> str | None:
+def numba_cannot(table: Tensor) -> str | None:
     """Why the compiled kernels cannot serve a field, or None if they can."""
     if table.device.type != "cpu":
         return f"the numba backend runs on the CPU, the field is on {table.device}"
     if table.dtype != torch.float32:
         return f"the numba backend computes in float32, the field is {table.dtype}"
-    if layout.features != 8:
-        return f"the numba backend needs 8 features per level, the field has {layout.features}"
     return None
 
 
-def warp_cannot(layout: GridLayout, table: Tensor) -> str | None:
+def warp_cannot(table: Tensor) -> str | None:
     """Why the kernels for GPUs cannot serve a field, or None if they can; only imports Warp if all else fits."""
     if table.dtype != torch.float32:
         return f"the warp backend computes in float32, the field is {table.dtype}"
-    if layout.features != 8:
-        return f"the warp backend needs 8 features per level, the field has {layout.features}"
     if table.device.type not in ("cpu", "cuda"):
         return f"the warp backend runs on CUDA and on the CPU, the field is on {table.device}"
     if find_spec("warp") is None:
@@ -371,10 +354,7 @@ class _Merged(torch.autograd.Function):
 
 
 def value(
-    backend: FieldBackend | MergedBackend,
-    buffer: TableGradient | None,
-    state: FieldState,
-    p: Float[Tensor, "n 3"],
+    backend: FieldBackend | MergedBackend, buffer: TableGradient | None, state: FieldState, p: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n"]:
     """Values at `p`, differentiable with respect to parameters and points.
 
@@ -386,10 +366,7 @@ def value(
 
 
 def value_and_gradient(
-    backend: FieldBackend | MergedBackend,
-    buffer: TableGradient | None,
-    state: FieldState,
-    p: Float[Tensor, "n 3"],
+    backend: FieldBackend | MergedBackend, buffer: TableGradient | None, state: FieldState, p: Float[Tensor, "n 3"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Values and gradients at `p`, both differentiable with respect to the parameters; `p` is a constant."""
     if isinstance(backend, MergedBackend):

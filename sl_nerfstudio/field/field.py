@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+import tyro
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -88,33 +89,27 @@ def _read_filled(cache: CachedGrid, _: object) -> None:
     cache.is_filled = bool(cache.filled)
 
 
+MIN_RESOLUTION = 16  # cells per axis of the grid's coarsest level
+HIDDEN_LAYERS = 2  # of the MLP
+KNEE = 0.02  # half-width of the rounded corner of the activation, a ReLU that is twice continuously differentiable
+SPHERE_RADIUS = 0.5  # scene units: of the sphere that the field starts from
+
+
 @dataclass
 class FieldConfig:
-    """Size and initial state of the field; the defaults are the paper's sizes."""
+    """Size of the field; the defaults are the paper's."""
 
-    levels: int = 5
-    """Levels of the feature grid."""
-    min_resolution: int = 16
-    """Cells per axis of the coarsest level."""
     max_resolution: int = 256
-    """Cells per axis of the finest level; levels grow geometrically (by 2 with the defaults)."""
-    features: int = 8
-    """Numbers stored at each grid corner."""
-    log2_table_size: int = 19
-    """Levels with more corners than 2 to this power share rows by hashing."""
-    smooth: bool = False
-    """Smoothstep instead of linear interpolation: the gradient is then continuous across cells."""
-    hidden: int = 128
-    """Width of the MLP's hidden layers."""
-    hidden_layers: int = 2
-    """Number of the MLP's hidden layers."""
-    knee: float = 0.02
-    """Half-width of the rounded corner of the activation, a ReLU that is twice continuously differentiable."""
-    sphere_radius: float = 0.5
-    """Radius, in scene units, of the sphere the field starts from."""
+    """Cells per axis of the grid's finest level; levels grow geometrically, by 2 with the default."""
     backend: BackendName = "auto"
     """numba: compiled for this CPU; warp: kernels for GPUs, which need the extra [cuda]; torch: any device and
     precision; auto: numba on the CPU and warp on GPUs, wherever they work."""
+    levels: tyro.conf.Suppress[int] = 5
+    """Levels of the feature grid."""
+    log2_table_size: tyro.conf.Suppress[int] = 19
+    """Levels with more corners than 2 to this power share rows by hashing."""
+    hidden: tyro.conf.Suppress[int] = 128
+    """Width of the MLP's hidden layers."""
 
 
 class SDFField(nn.Module):
@@ -123,21 +118,13 @@ class SDFField(nn.Module):
     def __init__(self, config: FieldConfig):
         super().__init__()
         self.config = config
-        self.encoding = HashGrid(
-            GridLayout.build(
-                config.levels,
-                config.min_resolution,
-                config.max_resolution,
-                config.features,
-                config.log2_table_size,
-                config.smooth,
-            )
-        )
-        widths = [3 + self.encoding.layout.width] + [config.hidden] * config.hidden_layers + [1]
+        layout = GridLayout.build(config.levels, MIN_RESOLUTION, config.max_resolution, config.log2_table_size)
+        self.encoding = HashGrid(layout)
+        widths = [3 + layout.width] + [config.hidden] * HIDDEN_LAYERS + [1]
         self.mlp = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
-        self._torch = TorchField(self.encoding.layout, config.knee)
+        self._torch = TorchField(layout, KNEE)
         self._compiled: dict[str, FieldBackend | MergedBackend] = {}
-        self._start_as_sphere(config.sphere_radius)
+        self._start_as_sphere(SPHERE_RADIUS)
 
     def _start_as_sphere(self, radius: float) -> None:
         """Weights for which `f(p) ~ |p| - radius`: random hidden layers, last layer by ridge regression.
@@ -175,7 +162,7 @@ class SDFField(nn.Module):
 
     def _hidden(self, h: Float[Tensor, "n w"]) -> Float[Tensor, "n hidden"]:
         for layer in self.hidden:
-            h = knee(layer(h), self.config.knee)
+            h = knee(layer(h), KNEE)
         return h
 
     def set_level_weights(self, weights: Float[Tensor, "levels"]) -> None:
@@ -214,7 +201,7 @@ class SDFField(nn.Module):
     def obstacle(self, backend: Literal["numba", "warp"]) -> str | None:
         """Why a compiled backend cannot serve the field where it is, or None if it can."""
         cannot = numba_cannot if backend == "numba" else warp_cannot
-        return cannot(self.encoding.layout, self.encoding.table)
+        return cannot(self.encoding.table)
 
     @property
     def backend(self) -> Literal["torch", "numba", "warp"]:
@@ -236,9 +223,7 @@ class SDFField(nn.Module):
         if name == "torch":
             return self._torch
         if name not in self._compiled:
-            self._compiled[name] = (_numba_field if name == "numba" else _warp_field)(
-                self.encoding.layout, self.config.knee
-            )
+            self._compiled[name] = _compiled(name, self.encoding.layout)
         return self._compiled[name]
 
     def _buffer(self) -> TableGradient | None:
@@ -247,15 +232,12 @@ class SDFField(nn.Module):
         return TableGradient.of(self.encoding.table) if wanted else None
 
 
-def _numba_field(layout: GridLayout, knee: float) -> FieldBackend:
-    """The compiled backend; numba is imported only when it is needed (it takes a second)."""
-    from sl_nerfstudio.field.numba_backend import NumbaField
+def _compiled(name: str, layout: GridLayout) -> FieldBackend | MergedBackend:
+    """A compiled backend; numba and Warp, which take a second to import, are imported only when needed."""
+    if name == "numba":
+        from sl_nerfstudio.field.numba_backend import NumbaField
 
-    return NumbaField(layout, knee)
-
-
-def _warp_field(layout: GridLayout, knee: float) -> MergedBackend:
-    """The backend for GPUs; Warp is imported only when it is needed."""
+        return NumbaField(layout, KNEE)
     from sl_nerfstudio.field.warp_backend import WarpField
 
-    return WarpField(layout, knee)
+    return WarpField(layout, KNEE)

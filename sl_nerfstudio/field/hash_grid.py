@@ -30,6 +30,7 @@ class SignedDistance(Protocol):
         ...
 
 
+FEATURES = 8  # numbers per table row: one vector of the compiled kernels
 PRIMES = (1, 2654435761, 805459861)  # of the spatial hash; the first is 1, so neighbours along x share a cache line
 
 
@@ -45,29 +46,23 @@ class GridLayout:
     """Rows of each level: at least as many as its corners, unless it is hashed."""
     hashed: tuple[bool, ...]
     """Whether rows are found by hashing (the size is then a power of two) instead of dense indexing."""
-    features: int
-    """Numbers per row."""
-    smooth: bool = False
-    """Interpolate with smoothstep weights (Heo et al., ICML 2023) instead of linearly."""
 
     @staticmethod
-    def build(
-        levels: int, min_resolution: int, max_resolution: int, features: int, log2_table_size: int, smooth: bool
-    ) -> "GridLayout":
+    def build(levels: int, min_resolution: int, max_resolution: int, log2_table_size: int) -> "GridLayout":
         """Levels growing geometrically from `min_resolution` to `max_resolution`.
 
         Raises:
             ValueError: there is no level, or the resolutions are not increasing.
         """
-        if levels < 1 or features < 1 or not 1 <= min_resolution <= max_resolution:
-            raise ValueError(f"invalid grid: {levels} levels, {min_resolution}..{max_resolution}, {features} features")
+        if levels < 1 or not 1 <= min_resolution <= max_resolution:
+            raise ValueError(f"invalid grid: {levels} levels, {min_resolution}..{max_resolution}")
         growth = (max_resolution / min_resolution) ** (1 / max(levels - 1, 1))
         resolutions = tuple(round(min_resolution * growth**level) for level in range(levels))
         corners = [(r + 1) ** 3 for r in resolutions]
         sizes = tuple(min(-(-n // 8) * 8, 2**log2_table_size) for n in corners)  # whole cache lines
         offsets = tuple(sum(sizes[:level]) for level in range(levels))
         hashed = tuple(n > 2**log2_table_size for n in corners)
-        return GridLayout(resolutions, offsets, sizes, hashed, features, smooth)
+        return GridLayout(resolutions, offsets, sizes, hashed)
 
     @property
     def levels(self) -> int:
@@ -82,7 +77,7 @@ class GridLayout:
     @property
     def width(self) -> int:
         """Length of an encoded point: levels times features."""
-        return self.levels * self.features
+        return self.levels * FEATURES
 
 
 class HashGrid(nn.Module):
@@ -98,7 +93,7 @@ class HashGrid(nn.Module):
     def __init__(self, layout: GridLayout):
         super().__init__()
         self.layout = layout
-        self.table = nn.Parameter(torch.empty(layout.rows, layout.features).uniform_(-1e-4, 1e-4))
+        self.table = nn.Parameter(torch.empty(layout.rows, FEATURES).uniform_(-1e-4, 1e-4))
         self.register_buffer("level_weights", torch.ones(layout.levels))
         kept = [size - 1 if hashed else 0 for size, hashed in zip(layout.sizes, layout.hashed, strict=True)]
         places = torch.tensor([layout.resolutions, layout.offsets, kept], dtype=torch.int32).T.contiguous()

@@ -13,9 +13,9 @@ from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.field.backend import FieldState, Pulled
-from sl_nerfstudio.field.hash_grid import GridLayout
+from sl_nerfstudio.field.hash_grid import FEATURES, GridLayout
 from sl_nerfstudio.field.numba_grid import FIRST, POINTS, GridArrays, clamped, encode, inside, scatter_level
-from sl_nerfstudio.field.simd import FEATURES, contract, kernel, multiply, part
+from sl_nerfstudio.field.simd import contract, kernel, multiply, part
 from sl_nerfstudio.parallel import parallel, split, threads
 
 # The MLP in numba, on one chunk of encoded points at a time.
@@ -200,14 +200,11 @@ def directional(network, scratch, rows):
 
 # The whole field in numba: value, gradient, and their pull-backs, for a range of points.
 #
-# Each kernel encodes a chunk of points, runs the MLP on it and discards everything: recomputing a chunk in the
-# core's
-# cache is cheaper than storing and re-reading its activations. Sums over points go into buffers of the range, so
-# that
+# Each kernel encodes a chunk of points, runs the MLP on it and discards everything: recomputing a chunk in the core's
+# cache is cheaper than storing and re-reading its activations. Sums over points go into buffers of the range, so that
 # ranges can run in parallel and results do not depend on how they were scheduled.
 #
-# The gradient's pull-back rests on this: for a constant direction v, `v . grad f` is the directional derivative of
-# f,
+# The gradient's pull-back rests on this: for a constant direction v, `v . grad f` is the directional derivative of f,
 # so its parameter gradient is one more reverse sweep through the pair (f, directional derivative of f).
 
 
@@ -381,7 +378,6 @@ def pack_grid(layout: GridLayout, state: FieldState) -> GridArrays:
         offsets=np.array(layout.offsets, np.int64),
         sizes=np.array(layout.sizes, np.int64),
         hashed=np.array(layout.hashed, np.bool_),
-        smooth=layout.smooth,
     )
 
 
@@ -522,18 +518,7 @@ class NumbaField:
 
         def work(sums: Weights, levels: np.ndarray, slopes: np.ndarray, offset: int, start: int, stop: int) -> None:
             pull_back_gradient_fused(
-                grid,
-                network,
-                _scratch(network),
-                xyz,
-                start,
-                stop,
-                upstream,
-                direction,
-                sums,
-                levels,
-                slopes,
-                offset,
+                grid, network, _scratch(network), xyz, start, stop, upstream, direction, sums, levels, slopes, offset
             )
 
         parts = self._sweep(grid, network, xyz, direction, True, table_gradient, marks, work)

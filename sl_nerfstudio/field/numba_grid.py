@@ -9,16 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy import ndarray
 
-from sl_nerfstudio.field.hash_grid import PRIMES
-from sl_nerfstudio.field.simd import FEATURES, gather, gather_jacobian, kernel, part, prefetch, scatter, scatter_pair
+from sl_nerfstudio.field.hash_grid import FEATURES, PRIMES
+from sl_nerfstudio.field.simd import gather, gather_jacobian, kernel, part, prefetch, scatter, scatter_pair
 
 # The feature grid in numba: gather features and their Jacobian, scatter gradients; eight features per level.
 #
 # A chunk of points is encoded into `e` [POINTS, depth]: columns 0..2 the point, 3 the constant 1 (it carries the
-# first
-# layer's bias), 4..7 zero, then the levels; `depth` is padded to a multiple of 16. The Jacobian `jac` [POINTS, 3,
-# depth]
-# holds the derivatives of the level columns with respect to the three coordinates.
+# first layer's bias), 4..7 zero, then the levels; `depth` is padded to a multiple of 16. The Jacobian `jac` [POINTS,
+# 3, depth] holds the derivatives of the level columns with respect to the three coordinates.
 
 POINTS = 128
 """Points per chunk: its activations stay in the core's own cache."""
@@ -44,8 +42,6 @@ class GridArrays(NamedTuple):
     """int64 [levels]: rows."""
     hashed: ndarray
     """bool [levels]."""
-    smooth: bool
-    """Smoothstep interpolation."""
 
 
 @part
@@ -68,13 +64,6 @@ def along(x, resolution):
     cell = np.int64(u)
     cell = cell if cell < resolution else resolution - 1
     return cell, u - np.float32(cell)
-
-
-@part
-def eased(t, smooth):
-    """For `smooth` = 0, `t` and its slope 1; for `smooth` = 1, smoothstep `3 t^2 - 2 t^3` and its slope."""
-    bent = t * t * (np.float32(3) - np.float32(2) * t)
-    return t + smooth * (bent - t), _ONE + smooth * (np.float32(6) * t * (_ONE - t) - _ONE)
 
 
 @part
@@ -121,7 +110,7 @@ def level_of(grid, level):
 @part
 def encode_level(grid, level, count, e, depth):
     """Write one level's columns of `e`."""
-    place, smooth, weight = level_of(grid, level), np.float32(grid.smooth), grid.weights[level]
+    place, weight = level_of(grid, level), grid.weights[level]
     column = FIRST + FEATURES * level
     for i in range(count):
         row = i * depth
@@ -129,14 +118,13 @@ def encode_level(grid, level, count, e, depth):
             ahead = row + _POINTS_AHEAD * depth
             prefetch(grid.table, locate(e[ahead], e[ahead + 1], e[ahead + 2], place)[0])
         corners, tx, ty, tz = locate(e[row], e[row + 1], e[row + 2], place)
-        t = eased(tx, smooth)[0], eased(ty, smooth)[0], eased(tz, smooth)[0]
-        gather(grid.table, corners, t, weight, e, row + column)
+        gather(grid.table, corners, (tx, ty, tz), weight, e, row + column)
 
 
 @part
 def encode_level_jacobian(grid, level, count, e, depth, jac, p, start):
     """Write one level's columns of `e` and `jac`."""
-    place, smooth, weight = level_of(grid, level), np.float32(grid.smooth), grid.weights[level]
+    place, weight = level_of(grid, level), grid.weights[level]
     column = FIRST + FEATURES * level
     slope = weight * _HALF * np.float32(grid.resolutions[level])
     for i in range(count):
@@ -145,12 +133,9 @@ def encode_level_jacobian(grid, level, count, e, depth, jac, p, start):
             ahead = row + _POINTS_AHEAD * depth
             prefetch(grid.table, locate(e[ahead], e[ahead + 1], e[ahead + 2], place)[0])
         corners, tx, ty, tz = locate(e[row], e[row + 1], e[row + 2], place)
-        tx, dx = eased(tx, smooth)
-        ty, dy = eased(ty, smooth)
-        tz, dz = eased(tz, smooth)
-        dx *= slope * inside(p[start + i, 0])
-        dy *= slope * inside(p[start + i, 1])
-        dz *= slope * inside(p[start + i, 2])
+        dx = slope * inside(p[start + i, 0])
+        dy = slope * inside(p[start + i, 1])
+        dz = slope * inside(p[start + i, 2])
         at = 3 * row + column
         gather_jacobian(grid.table, corners, (tx, ty, tz), weight, e, row + column, (dx, dy, dz), jac, at, depth)
 
@@ -223,7 +208,7 @@ def scatter_level(grid, level, p, start, count, values, gradient, marks, v, slop
     weight = grid.weights[level]
     if weight == _ZERO:
         return
-    place, smooth = level_of(grid, level), np.float32(grid.smooth)
+    place = level_of(grid, level)
     slope = weight * _HALF * np.float32(grid.resolutions[level])
     flat, flat_slopes = values[level].reshape(-1), slopes[level].reshape(-1)
     for i in range(count):
@@ -236,14 +221,11 @@ def scatter_level(grid, level, p, start, count, values, gradient, marks, v, slop
             prefetch(gradient, locate(clamped(px), clamped(py), clamped(pz), place)[0])
         px, py, pz = p[start + i, 0], p[start + i, 1], p[start + i, 2]
         corners, tx, ty, tz = locate(clamped(px), clamped(py), clamped(pz), place)
-        tx, dx = eased(tx, smooth)
-        ty, dy = eased(ty, smooth)
-        tz, dz = eased(tz, smooth)
         weights = corner_weights(tx, ty, tz, weight)
         if with_slopes:
-            vx = v[start + i, 0] * inside(px) * dx * slope
-            vy = v[start + i, 1] * inside(py) * dy * slope
-            vz = v[start + i, 2] * inside(pz) * dz * slope
+            vx = v[start + i, 0] * inside(px) * slope
+            vy = v[start + i, 1] * inside(py) * slope
+            vz = v[start + i, 2] * inside(pz) * slope
             changes = corner_slopes(tx, ty, tz, vx, vy, vz)
             scatter_pair(gradient, corners, FEATURES * i, weights, flat, changes, flat_slopes)
         else:
@@ -282,54 +264,6 @@ def clear(gradient, marks, start, stop, rows):
                 prefetch(gradient, (rows[k + _ROWS_AHEAD] * FEATURES,))
             for i in range(FEATURES):
                 gradient[rows[k] * FEATURES + i] = _ZERO
-
-
-@part
-def list_any(marks, start, stop, rows):
-    """As `list_marked`, of rows that any process marked (processes, marks), which are then marked in all of them."""
-    words, n, row = marks.view(np.int64), 0, start
-    while row < stop and n <= len(rows) - 8:
-        together = words[0, row // 8]
-        for k in range(1, len(words)):
-            together |= words[k, row // 8]
-        if together != 0:
-            for k in range(len(words)):
-                words[k, row // 8] = together
-            for i in range(row, min(row + 8, stop)):
-                if marks[0, i]:
-                    rows[n] = i
-                    n += 1
-        row += 8
-    return n, row
-
-
-@kernel
-def average(gradients, marks, start, stop, rows, own, count):
-    """Mean over processes of the rows in `start .. stop` that any of them marked, for all of them; marks become equal.
-
-    `gradients` [process, row * 8], `marks` [process, row]. Every `count`-th stretch of LIST rows, from number `own` on,
-    is done; `start` is at a multiple of LIST * count.
-    """
-    processes, share = len(gradients), _ONE / np.float32(len(gradients))
-    first = start + own * LIST
-    while first < stop:
-        end = min(first + LIST, stop)
-        row = first
-        while row < end:
-            n, row = list_any(marks, row, end, rows)
-            for k in range(n):
-                if k + _ROWS_AHEAD < n:
-                    for p in range(processes):
-                        prefetch(gradients[p], (rows[k + _ROWS_AHEAD] * FEATURES,))
-                at = rows[k] * FEATURES
-                for i in range(at, at + FEATURES):
-                    total = gradients[0, i]
-                    for p in range(1, processes):
-                        total += gradients[p, i]
-                    total *= share
-                    for p in range(processes):
-                        gradients[p, i] = total
-        first += count * LIST
 
 
 @kernel

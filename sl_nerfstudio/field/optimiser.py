@@ -143,12 +143,7 @@ def _device_kernel_can(parameter: Tensor) -> bool:
 
 
 def _step_device(
-    parameter: nn.Parameter,
-    state: dict[str, Tensor],
-    lr: float | Tensor,
-    beta1: float,
-    beta2: float,
-    eps: float,
+    parameter: nn.Parameter, state: dict[str, Tensor], lr: float | Tensor, beta1: float, beta2: float, eps: float
 ) -> None:
     """The step as one kernel; clears the gradient."""
     from sl_nerfstudio.field.device_kernels import launch

@@ -18,12 +18,11 @@ from numba import njit, types
 from numba.core import cgutils
 from numba.extending import intrinsic as _intrinsic
 
+from sl_nerfstudio.field.hash_grid import FEATURES
 from sl_nerfstudio.parallel import ANY_ORDER
 
 intrinsic: Any = _intrinsic  # callers omit the typing context, which type checkers cannot know
 F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
-FEATURES = 8
-"""Numbers per table row: one vector."""
 _AVX512 = bool(llvmlite.binding.get_host_cpu_features().get("avx512f"))
 WIDTH, ROWS = (16, 8) if _AVX512 else (8, 4)
 """Shape of a tile: up to 3 vectors of WIDTH numbers times ROWS rows (24 of 32 registers, or 12 of 16)."""

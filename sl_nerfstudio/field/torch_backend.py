@@ -8,7 +8,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from sl_nerfstudio.field.backend import FieldState, Pulled
-from sl_nerfstudio.field.hash_grid import PRIMES, GridLayout
+from sl_nerfstudio.field.hash_grid import FEATURES, PRIMES, GridLayout
 
 # The feature grid in plain torch: the reference for tests of the fast versions, and the version that runs on GPUs.
 
@@ -35,8 +35,6 @@ def corner_weights(
     cell = x.detach().nan_to_num(0).floor().clamp(0, layout.resolutions[level] - 1)
     t = x - cell
     slope = torch.full_like(t, half)
-    if layout.smooth:
-        t, slope = t * t * (3 - 2 * t), slope * (6 * t * (1 - t))
     pair = torch.stack([1 - t, t], -1)  # [n, axis, side]
     step = torch.stack([-slope, slope], -1)
 
@@ -95,9 +93,9 @@ class TorchField:
         """MLP input, and its derivative with respect to `p`."""
         q = p.clamp(-1, 1)
         inside = (p == q).to(p.dtype)
-        e = [q] + [p.new_zeros(len(p), self.layout.features)] * self.layout.levels
+        e = [q] + [p.new_zeros(len(p), FEATURES)] * self.layout.levels
         diagonal = torch.diag_embed(inside)
-        jac = [diagonal] + [p.new_zeros(len(p), self.layout.features, 3)] * self.layout.levels
+        jac = [diagonal] + [p.new_zeros(len(p), FEATURES, 3)] * self.layout.levels
         for level in state.active:
             cell, weight, slope = corner_weights(self.layout, level, q)
             rows = state.table.detach()[corner_rows(self.layout, level, cell)] * state.level_weights[level]
@@ -200,10 +198,9 @@ class TorchField:
     ) -> None:
         """Add adjoints `d` of the MLP's input to the table's gradient; `slopes` multiply the weights' derivatives."""
         q = p.clamp(-1, 1)
-        features = self.layout.features
         for level in state.active:
             cell, weight, slope = corner_weights(self.layout, level, q)
-            columns = slice(3 + level * features, 3 + (level + 1) * features)
+            columns = slice(3 + level * FEATURES, 3 + (level + 1) * FEATURES)
             values = weight[..., None] * d[:, None, columns]
             if slopes is not None and v is not None:
                 values = values + ((slope * (v * (p == q))[:, None]).sum(-1, keepdim=True) * slopes[:, None, columns])

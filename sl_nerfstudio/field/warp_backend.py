@@ -41,7 +41,7 @@ class WarpField:
     def __init__(self, layout: GridLayout, knee: float):
         self.layout = layout
         self.knee = knee
-        self._smooth = int(layout.smooth)
+        self._smooth = 0  # linear interpolation
 
     def evaluate_all(self, state: FieldState, p: Float[Tensor, "n 3"], first: int) -> tuple[Tensor, Tensor, _Kept]:
         """See `MergedBackend`."""

@@ -21,21 +21,15 @@ from sl_nerfstudio.meshing.mesh import Mesh
 # Corner `c` of a cell lies at `(c & 1, c >> 1 & 1, c >> 2 & 1)`. Bit `c` of a case is set where the field is
 # negative there (inside). Edge `4 * axis + k` runs along `axis`; see EDGE_CORNERS.
 #
-# On every face of the cell the negative corners are separated: a diagonal pair gives two segments, each cutting off
-# one
-# negative corner. This depends only on the signs at that face, so the two cells at a face draw the same segments,
-# and
+# On every face of the cell the negative corners are separated: a diagonal pair gives two segments, each cutting off one
+# negative corner. This depends only on the signs at that face, so the two cells at a face draw the same segments, and
 # each edge that the surface cuts has exactly one segment on each of its faces: the segments form closed loops
 # (Lorensen and Cline, SIGGRAPH 1987, with the face rule that makes their table free of holes).
 
 AXIS_STEP = (1, 2, 4)  # what a step along x, y, z adds to a corner's number
 
 
-def _edge_corners() -> list[tuple[int, int]]:
-    return [(c, c + step) for step in AXIS_STEP for c in range(8) if not c & step]
-
-
-EDGE_CORNERS: tuple[tuple[int, int], ...] = tuple(_edge_corners())
+EDGE_CORNERS = tuple((c, c + step) for step in AXIS_STEP for c in range(8) if not c & step)
 """Lower and upper corner of each of the 12 edges; edges 0 to 3 along x, 4 to 7 along y, 8 to 11 along z."""
 
 _EDGE_OF_CORNERS = {frozenset(pair): edge for edge, pair in enumerate(EDGE_CORNERS)}
@@ -77,10 +71,6 @@ def _loops(case: int) -> list[list[int]]:
     return loops
 
 
-def _on_one_face(a: int, b: int) -> bool:
-    return any(a in edges and b in edges for edges in _FACE_EDGES)
-
-
 def _triangulate(loop: list[int]) -> list[tuple[int, int, int]] | None:
     """Triangles of a loop without a diagonal inside a face of the cell; None if there is no such choice.
 
@@ -90,7 +80,7 @@ def _triangulate(loop: list[int]) -> list[tuple[int, int, int]] | None:
         return [(loop[0], loop[1], loop[2])]
     n = len(loop)
     for i, j in combinations(range(n), 2):
-        if j - i in (1, n - 1) or _on_one_face(loop[i], loop[j]):
+        if j - i in (1, n - 1) or any({loop[i], loop[j]} <= edges for edges in _FACE_EDGES):
             continue
         left, right = _triangulate(loop[i : j + 1]), _triangulate(loop[j:] + loop[: i + 1])
         if left is not None and right is not None:
@@ -123,8 +113,7 @@ def triangle_table() -> tuple[Int[ndarray, "256 t 3"], Int[ndarray, "256"]]:
 
 # A regular grid of cells of which only those near the surface are visited.
 #
-# Cells and corners have integer positions (x, y, z) from 0. A block is a cube of `size` cells, named by its lower
-# cell.
+# Cells and corners have integer positions (x, y, z) from 0. A block is a cube of `size` cells, named by its lower cell.
 
 Field = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
 """Signed distance, negative inside, of points; both in the units of the box."""
@@ -167,7 +156,7 @@ class SparseGrid:
         return out
 
     def corner_keys(self, corner: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
-        """One number for each corner of the grid."""
+        """Number the corners of the grid."""
         nx, ny = self.cells[0] + 1, self.cells[1] + 1
         return corner[..., 0] + nx * (corner[..., 1] + ny * corner[..., 2])
 
@@ -394,5 +383,5 @@ def _vertices(grid: SparseGrid, leaves: Leaves, edges: Int[Tensor, "v 2"], polis
 
 
 def _zero(a: Tensor, b: Tensor, value_a: Tensor, value_b: Tensor) -> Tensor:
-    """Where the line through (a, value_a) and (b, value_b), of opposite signs, is zero."""
+    """Find where the line through (a, value_a) and (b, value_b), of opposite signs, is zero."""
     return a + (b - a) * value_a / (value_a - value_b)

@@ -1,4 +1,8 @@
-"""Meshes as files: PLY, OBJ, STL and GLB, chosen by the suffix."""
+"""Meshes as files, PLY, OBJ, STL and GLB, chosen by the suffix; and point clouds, PLY and LAS.
+
+trimesh reads them. What writes them is our own: trimesh's PLY rounds positions to float32 and has no comment for the
+unit, and its GLB takes sRGB colours of vertices for linear ones.
+"""
 
 import io
 import json
@@ -25,7 +29,7 @@ Y_UP_Z_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 
 
 def file_from_world(suffix: str, units: str) -> Similarity:
-    """From a scan's world and unit to what a mesh file holds.
+    """Map a scan's world and unit to what a mesh file holds.
 
     glTF (.glb) is in metres with y up by its specification; STL (.stl) in millimetres by custom, in the scan's axes.
     One arbitrary unit becomes one of the file's.
@@ -168,14 +172,11 @@ def encode_mtl(coloured: bool, image: str | None) -> bytes:
 
 def encode_stl(mesh: Mesh, unit: str) -> bytes:
     """Binary STL; its header names the unit."""
-    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    rows = np.zeros(len(mesh.faces), dtype=[("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
-    rows["normal"] = normal / np.where(length > 0, length, 1.0)
-    rows["corner"] = np.stack([a, b, c], 1)
-    header = f"binary STL, lengths in {unit}".encode().ljust(80)
-    return header + np.uint32(len(rows)).tobytes() + rows.tobytes()
+    import trimesh
+    from trimesh.exchange.stl import export_stl
+
+    surface = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    return f"binary STL, lengths in {unit}".encode().ljust(80) + export_stl(surface)[80:]
 
 
 # Meshes as bytes of GLB files: binary glTF 2.0.
@@ -221,7 +222,7 @@ def encode_glb(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, texture: Textur
 
 
 def _attributes(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, texture: Texture | None) -> dict[str, ndarray]:
-    """Of the vertices; those of charts where there is a texture, because each has one texture coordinate."""
+    """Attributes of the vertices, or of the corners of charts, each of which has one texture coordinate."""
     found = {"POSITION": mesh.vertices.astype("<f4"), "NORMAL": mesh.vertex_normals().astype("<f4")}
     if texture is not None:
         found = {name: values[texture.charts.vertex] for name, values in found.items()}
@@ -259,7 +260,7 @@ def _accessor(view: int, array: ndarray) -> dict[str, Any]:
 
 
 def _views(parts: list[bytes], targets: list[int | None]) -> list[dict[str, int]]:
-    """Where in the buffer each part is, and what for."""
+    """Say where in the buffer each part is, and what for."""
     views, at = [], 0
     for part, target in zip(parts, targets, strict=True):
         view = {"buffer": 0, "byteOffset": at, "byteLength": len(part)}

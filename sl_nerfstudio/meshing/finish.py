@@ -1,4 +1,4 @@
-"""Holes of a trimmed mesh, closed by what was trimmed away: the zero level of the field."""
+"""Finishing a mesh: its observed part marked, holes filled, a closed solid, fewer triangles."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -47,7 +47,7 @@ class MarkedMesh:
 
 @dataclass(frozen=True)
 class ClosestPoints:
-    """For each given point the closest one of a mesh; lengths in the mesh's unit."""
+    """Points of a mesh, each the closest to a given one; lengths in the mesh's unit."""
 
     distance: Float64[ndarray, "n"]
     triangle: Int64[ndarray, "n"]
@@ -71,7 +71,7 @@ class ClosestSurface:
         return self._o3d.core.Tensor(((points - self._centre) / self._scale).astype(np.float32))
 
     def closest(self, points: Float64[ndarray, "n 3"]) -> ClosestPoints:
-        """Of every point."""
+        """Find the closest point of the mesh to every point."""
         found = self._scene.compute_closest_points(self._scaled(points))
         u, v = found["primitive_uvs"].numpy().T.astype(np.float64)
         there = found["points"].numpy() * self._scale + self._centre

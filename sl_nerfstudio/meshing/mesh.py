@@ -1,4 +1,4 @@
-"""The mesh type of this package."""
+"""Triangle meshes, what is known about their vertices, and their textures."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -104,7 +104,7 @@ class VertexQuality:
 # Everything that is written with a vertex beside its place.
 
 GREY = 128
-"""Of vertices whose colour no capture shows."""
+"""Colour of vertices that no capture shows."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +116,12 @@ class VertexProperties:
     colour: UInt8[ndarray, "v 3"] | None = None  # sRGB; None: no frame was also captured without the pattern
 
     def chosen(self, index: Int[ndarray, "n"] | Bool[ndarray, "v"]) -> "VertexProperties":
-        """Those of the chosen vertices, in that order."""
+        """Properties of the chosen vertices, in that order."""
         quality = VertexQuality(**{name: values[index] for name, values in vars(self.quality).items()})
         return VertexProperties(quality, self.invented[index], None if self.colour is None else self.colour[index])
 
     def moved(self, distance: Float[ndarray, "v"]) -> "VertexProperties":
-        """Those of vertices that were moved away from the surface: a further error in their uncertainty."""
+        """Add the distance by which vertices were moved away from the surface to their uncertainty."""
         q = self.quality
         sigma, independent = (np.hypot(values, distance) for values in (q.sigma, q.sigma_independent))
         return replace(self, quality=replace(q, sigma=sigma, sigma_independent=independent))

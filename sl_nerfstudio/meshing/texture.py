@@ -1,4 +1,4 @@
-"""An image of a surface's colours, from captures that were also taken without the pattern."""
+"""Colours of a surface, of its vertices or as a texture, from captures that were also taken without the pattern."""
 
 import time
 from dataclasses import dataclass
@@ -18,8 +18,6 @@ from sl_nerfstudio.meshing.mesh import GREY, Charts, Mesh, Texture
 from sl_nerfstudio.meshing.visibility import Occluder
 from sl_nerfstudio.parallel import compiled, results, threads
 from sl_nerfstudio.scan.types import Frame, Scan
-
-# Colours of a surface, from captures that were also taken without the pattern.
 
 _LEAST_COSINE = 0.2
 """Between normal and line of sight: flatter views (beyond 78 degrees) mix in what is behind the edge of the object."""
@@ -105,11 +103,9 @@ def _look_up(frame: Frame, uv: Float64[ndarray, "n 2"]) -> Float64[ndarray, "n 3
 # A mesh laid out flat: pieces of it (charts) side by side in a square.
 
 MANY_CHARTS = 500
-"""At least so many: 50,000 triangles of a scan take 4 s then, and 28 s if charts may be large."""
+"""Least number of charts: 50,000 triangles of a scan take 4 s then, and 28 s if charts may be large."""
 
-_PIECE = (
-    30000  # triangles that xatlas gets at once: 526,000 take 32 s then, on one thread (whole: 54 s), and it has several
-)
+_PIECE = 30000  # triangles that xatlas gets at once: 526,000 take 32 s then, on one thread (whole: 54 s)
 _CHART_PX = 40.0  # side of a chart on average, if there are fewer: the padding takes most of the room of smaller ones
 _FILLED = 0.6  # share of the square that charts cover, as a first guess of their scale
 _PADDING_PX = 4  # between charts, so that filters of textures do not read across; about that after the square is filled
@@ -295,6 +291,6 @@ def _filled(image: UInt8[ndarray, "n n 3"], known: Bool[ndarray, "n n"]) -> UInt
 
 
 def _area(corners: Float64[ndarray, "f 3 2"]) -> float:
-    """Of triangles in the plane."""
+    """Total area of triangles in the plane."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     return float(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()) / 2

@@ -1,10 +1,4 @@
-"""Uncertainty of the distance between two points of the surface.
-
-A point that is measured on the surface moves with the poses of the frames that see it, along the surface as well as
-across it. It is where their rays meet: it minimises its residuals in camera pixels and projector pixels. The shared
-part of a length's variance follows from the joint covariance, in the gauge of the scan: the length that fixes the scale
-counts as exact. Decoding noise moves each end along its normal.
-"""
+"""Uncertainty of every vertex of a surface, and of distances on it, by linear propagation."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -33,10 +27,9 @@ from sl_nerfstudio.scan.types import Frame, Scan
 # How the residuals of one frame depend on the surface, on the frame's poses and on the intrinsics.
 #
 # A surface that is locally a plane moves by s along its normal, or the frame's poses change while its decoded
-# coordinates
-# stay. The residual is the predicted minus the decoded coordinate of a camera pixel, in projector pixels.
-# Increments are
-# those of `bundle_adjustment.residuals`; intrinsics are shares of the focal length (`IntrinsicsChange.values`).
+# coordinates stay. The residual is the predicted minus the decoded coordinate of a camera pixel, in projector pixels.
+# Increments are those of `bundle_adjustment.residuals`; intrinsics are shares of the focal length
+# (`IntrinsicsChange.values`).
 
 
 @dataclass(frozen=True)
@@ -128,29 +121,15 @@ _FEWEST = 20  # values of which a spread is stated
 
 
 @dataclass(frozen=True)
-class VertexViews:
-    """Pairs of a vertex and a frame that confirms it, by vertex; lengths in the scan's unit."""
+class FrameViews:
+    """What one frame confirms of a mesh; lengths in the scan's unit."""
 
-    vertex: Int64[ndarray, "m"]
-    frame: Int64[ndarray, "m"]
+    vertex: Int64[ndarray, "m"]  # ascending
     slope: Float[ndarray, "m 2"]  # of the residual along the normal, projector pixels per unit of length
     residual: Float[ndarray, "m 2"]  # predicted minus decoded coordinate, projector pixels
     pixels_per_area: Float[ndarray, "m"]
     ray_angle: Float[ndarray, "m"]  # between the rays of camera and projector, radian
-    noise_px: Float[ndarray, "frames"]  # 1 sigma of one pixel's coordinate, each component; NaN if unknown
-    correlation: float  # how many neighbouring pixels share an error: 1 if their errors are independent
-
-
-@dataclass(frozen=True)
-class FrameViews:
-    """The same of one frame."""
-
-    vertex: Int64[ndarray, "m"]  # ascending
-    slope: Float[ndarray, "m 2"]
-    residual: Float[ndarray, "m 2"]
-    pixels_per_area: Float[ndarray, "m"]
-    ray_angle: Float[ndarray, "m"]
-    noise_px: float
+    noise_px: float  # 1 sigma of one pixel's coordinate, each component; NaN if unknown
     window_ratio: float  # variance of a window's value over that of a pixel; NaN if unknown
 
 
@@ -167,9 +146,10 @@ def devices_of(scan: Scan, poses: DevicePoses, frame: int) -> FrameDevices:
 def views_by_frame(
     mesh: Mesh, scan: Scan, poses: DevicePoses, chosen: Int64[ndarray, "c"] | None, task: str
 ) -> Iterator[FrameViews]:
-    """Of each frame in order, what it confirms of a mesh, or of the `chosen` vertices; `task` names the progress.
+    """Yield what each frame, in order, confirms of a mesh or of the `chosen` vertices; `task` names the progress.
 
-    As many frames are in memory at a time as there are threads.
+    A frame confirms a vertex under the rules of `visibility`: its decoded coordinate is the one that the vertex
+    predicts. As many frames are in memory at a time as there are threads.
     """
     chosen = np.arange(len(mesh.vertices), dtype=np.int64) if chosen is None else chosen
     points, normals = mesh.vertices, mesh.vertex_normals()
@@ -181,42 +161,22 @@ def views_by_frame(
         )
 
 
-def collect_views(
-    mesh: Mesh,
-    scan: Scan,
-    poses: DevicePoses,
-    chosen: Int64[ndarray, "c"] | None = None,
-    task: str = "uncertainty of the surface",
-) -> VertexViews:
-    """All frames that see, light and confirm each vertex (or each of the `chosen` ones), which takes memory for each.
+@dataclass(frozen=True)
+class VertexViews:
+    """Pairs of a vertex and a frame that confirms it, by vertex."""
 
-    A frame confirms a vertex under the rules of `visibility`: its decoded coordinate is the one that the vertex
-    predicts.
-    """
+    vertex: Int64[ndarray, "m"]
+    frame: Int64[ndarray, "m"]
+    residual: Float[ndarray, "m 2"]  # as in FrameViews
+
+
+def collect_views(mesh: Mesh, scan: Scan, poses: DevicePoses, chosen: Int64[ndarray, "c"], task: str) -> VertexViews:
+    """Find all frames that confirm each of the chosen vertices."""
     found = list(views_by_frame(mesh, scan, poses, chosen, task))
-    vertex = np.concatenate([f.vertex for f in found])
+    vertex, residual = (np.concatenate([getattr(one, name) for one in found]) for name in ("vertex", "residual"))
     order = np.argsort(vertex, kind="stable")
-    frame = np.repeat(np.arange(len(found)), [len(f.vertex) for f in found])
-
-    def joined(name: str) -> ndarray:
-        return np.concatenate([getattr(f, name) for f in found])[order]
-
-    return VertexViews(
-        vertex=vertex[order],
-        frame=frame[order],
-        slope=joined("slope"),
-        residual=joined("residual"),
-        pixels_per_area=joined("pixels_per_area"),
-        ray_angle=joined("ray_angle"),
-        noise_px=np.array([f.noise_px for f in found]),
-        correlation=correlation_of([f.window_ratio for f in found]),
-    )
-
-
-def correlation_of(window_ratios: Sequence[float]) -> float:
-    """How many neighbouring pixels share an error, from what windows gain in each frame (NaN: unknown)."""
-    known = [ratio for ratio in window_ratios if np.isfinite(ratio)]
-    return max(1.0, window_pixels() * float(np.median(known))) if known else 1.0
+    frame = np.repeat(np.arange(len(found)), [len(one.vertex) for one in found])
+    return VertexViews(vertex[order], frame[order], residual[order])
 
 
 def _views_of(
@@ -229,16 +189,8 @@ def _views_of(
     poses: DevicePoses,
     k: int,
 ) -> FrameViews:
-    seen = lit_vertices(
-        points,
-        normals,
-        chosen,
-        occluder,
-        frame.camera,
-        scan.projector,
-        poses.T_world_camera[k],
-        poses.T_world_projector[k],
-    ).vertex
+    T = poses.T_world_camera[k], poses.T_world_projector[k]
+    seen = lit_vertices(points, normals, chosen, occluder, frame.camera, scan.projector, *T).vertex
     devices, coords = devices_of(scan, poses, k), frame.read_coords()
     view = view_surface(devices, torch.from_numpy(points[seen]), torch.from_numpy(normals[seen]))
     uv = view.uv_camera.numpy()
@@ -274,11 +226,17 @@ def _window_ratio(coords: Float[ndarray, "h w 2"], view: SurfaceView, good: Int6
     return (_spread(across[seen.valid.numpy()]) / noise) ** 2 if noise > 0 else float("nan")
 
 
-def window_pixels(half: int = HALF_WINDOW) -> float:
-    """How many independent pixels have the variance of one look-up in a window that is decoded throughout."""
+def _correlation(window_ratios: Sequence[float]) -> float:
+    """Estimate how many neighbouring pixels share an error from what windows gain in each frame (NaN: unknown).
+
+    If errors were independent, as many pixels as a decoded window has would gain what the fit in it gains.
+    """
+    known = [ratio for ratio in window_ratios if np.isfinite(ratio)]
+    half = HALF_WINDOW
     y, x = np.mgrid[-half : half + 1, -half : half + 1].reshape(2, -1).astype(float)
     basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], 1)
-    return 1 / float(np.linalg.inv(basis.T @ basis)[0, 0])
+    pixels = 1 / float(np.linalg.inv(basis.T @ basis)[0, 0])
+    return max(1.0, pixels * float(np.median(known))) if known else 1.0
 
 
 # What all frames say of every vertex of a mesh, added up frame by frame: memory does not depend on their number.
@@ -303,7 +261,7 @@ class VertexSums:
 
 
 def sum_views(views: Iterable[FrameViews], vertices: int) -> VertexSums:
-    """Of a mesh with a number of vertices, from the views of all frames in order."""
+    """Add up the views of all frames, in order, of a mesh with a number of vertices."""
     number, (distance, weight, variance, unknown, pull) = np.zeros(vertices, dtype=np.int64), np.zeros((5, vertices))
     ray_angle, noises, ratios, bits = np.full(vertices, np.nan), [], [], []
     for one in views:
@@ -325,28 +283,15 @@ def sum_views(views: Iterable[FrameViews], vertices: int) -> VertexSums:
         bits.append(np.packbits(mask))
     if unknown.any():  # a frame that confirms too few vertices has the noise of the others
         variance += unknown * (np.nanmedian(noises) ** 2 if np.isfinite(noises).any() else np.nan)
-    return VertexSums(
-        number,
-        distance,
-        ray_angle,
-        weight,
-        variance,
-        pull,
-        correlation_of(ratios),
-        np.stack(bits),
-    )
+    return VertexSums(number, distance, ray_angle, weight, variance, pull, _correlation(ratios), np.stack(bits))
 
 
-# The part of a vertex's uncertainty that comes from decoding noise, and from a field that does not follow the
-# pixels.
+# The part of a vertex's uncertainty that comes from decoding noise, and from a field that does not follow the pixels.
 #
-# The field averages the pixels of all frames over a small area of the surface. So the variance of a vertex is that
-# of a
-# pixel's coordinate, divided by the number of pixels in that area and by the square of their slope along the
-# normal.
-# Where the pixels, averaged over the same area, put the surface elsewhere, the distance counts instead: a field
-# that was
-# trained too briefly, or that rounds an edge, is farther from the truth than noise alone would put it.
+# The field averages the pixels of all frames over a small area of the surface. So the variance of a vertex is that of a
+# pixel's coordinate, divided by the number of pixels in that area and by the square of their slope along the normal.
+# Where the pixels, averaged over the same area, put the surface elsewhere, the distance counts instead: a field that
+# was trained too briefly, or that rounds an edge, is farther from the truth than noise alone would put it.
 
 AVERAGED_CELLS = 2.0
 """Area over which the field averages, in squares of its finest cells; measured with several draws of noise (1.4 to 3.8
@@ -393,11 +338,9 @@ class Smoothing:
 # Uncertainty of every vertex along its normal, by linear propagation.
 #
 # Near a vertex the surface minimises the residuals of all pixels that see it. So it moves along its normal by
-# `s = -sum(a . r) / sum(a . a)` when residuals change by r, with a the residuals' slope along the normal. Two kinds
-# of
+# `s = -sum(a . r) / sum(a . a)` when residuals change by r, with a the residuals' slope along the normal. Two kinds of
 # errors change them. Decoding noise is independent from one vertex to another that is farther away than the field
-# averages (`sigma_independent`). Errors of poses and intrinsics are shared by the whole surface: their joint
-# covariance
+# averages (`sigma_independent`). Errors of poses and intrinsics are shared by the whole surface: their joint covariance
 # is propagated, less the rigid motion of the whole surface, which changes no shape.
 
 _TOGETHER = 512  # neighbouring vertices, which mostly the same frames see
@@ -439,7 +382,7 @@ def _shared_variance(
         return out
     points = mesh.vertices - mesh.vertices[seen].mean(0)
     rigid = np.concatenate([normals, np.cross(points, normals)], 1)
-    devices = _all_devices(scan, poses)
+    devices = all_devices(scan, poses)
     kind = np.float64 if is_exact(len(joint.factor)) else np.float32  # random draws are off by more than rounding is
     factor = joint.factor.astype(kind, copy=False)
 
@@ -447,8 +390,8 @@ def _shared_variance(
         """Changes of some vertices by the columns of the factor."""
         confirmed = sums.confirmed(part)
         frames = np.flatnonzero(confirmed.any(0))
-        rows = _rows(mesh.vertices[part], normals[part], devices[frames], confirmed[:, frames])
-        columns = np.concatenate([_columns(frames, len(scan.frames)), np.arange(-UNKNOWNS, 0)])
+        rows = surface_rows(mesh.vertices[part], normals[part], devices[frames], confirmed[:, frames])
+        columns = _columns(frames, len(scan.frames))
         return rows.astype(kind, copy=False) @ factor[columns]
 
     some = seen[evenly_spaced(len(seen), min(_GAUGE_VERTICES, len(seen)))]
@@ -470,39 +413,35 @@ def _portions(vertices: Int64[ndarray, "v"]) -> list[Int64[ndarray, "_"]]:
 def surface_rows(
     points: Float[ndarray, "v 3"],
     normals: Float[ndarray, "v 3"],
-    scan: Scan,
-    poses: DevicePoses,
-    confirmed: Bool[ndarray, "v frames"],
-) -> Float[ndarray, "v joint"]:
-    """Derivatives of vertices along their normals by (delta, rho, intrinsics); each has a frame that confirms it."""
-    return _rows(points, normals, _all_devices(scan, poses), confirmed)
-
-
-def _rows(
-    points: Float[ndarray, "v 3"],
-    normals: Float[ndarray, "v 3"],
     devices: Float[ndarray, "some devices"],
     confirmed: Bool[ndarray, "v some"],
 ) -> Float[ndarray, "v joint"]:
-    """The columns of `surface_rows` that belong to some frames, among which are all that confirm the vertices."""
+    """Derivatives of vertices along their normals by delta and rho of some frames, and by the intrinsics.
+
+    Among the frames are all that confirm the vertices, each of which has one.
+    """
     out = np.zeros((len(points), 12 * len(devices) + UNKNOWNS))
     write_rows(confirmed, devices, points, normals, out)
     return out
 
 
-def _all_devices(scan: Scan, poses: DevicePoses) -> Float[ndarray, "frames devices"]:
+def all_devices(scan: Scan, poses: DevicePoses) -> Float[ndarray, "frames devices"]:
+    """The devices of all frames as compiled loops read them."""
     return np.stack([packed_devices(devices_of(scan, poses, k)) for k in range(len(scan.frames))])
 
 
-def _columns(some: Int64[ndarray, "some"], frames: int) -> Int64[ndarray, "twelve_each"]:
-    """Where delta of some frames, and then their rho, are among the unknowns."""
+def _columns(some: Int64[ndarray, "some"], frames: int) -> Int64[ndarray, "c"]:
+    """Places of delta of some frames, their rho, and the intrinsics among the unknowns."""
     delta = (6 * some[:, None] + np.arange(6)).reshape(-1)
-    return np.concatenate([delta, 6 * frames + delta])
+    return np.concatenate([delta, 6 * frames + delta, np.arange(12 * frames, 12 * frames + UNKNOWNS)])
 
 
-def columns_of(frame: int, frames: int) -> Int64[ndarray, "12"]:
-    """Where delta and rho of a frame are among the unknowns."""
-    return np.r_[6 * frame : 6 * frame + 6, 6 * (frames + frame) : 6 * (frames + frame) + 6]
+# Distances between two points of the surface.
+#
+# A point that is measured on the surface moves with the poses of the frames that see it, along the surface as well as
+# across it. It is where their rays meet: it minimises its residuals in camera pixels and projector pixels. The shared
+# part of a length's variance follows from the joint covariance, in the gauge of the scan: the length that fixes the
+# scale counts as exact. Decoding noise moves each end along its normal.
 
 
 @dataclass(frozen=True)
@@ -524,7 +463,7 @@ def length_sigma(
     """Uncertainty of the distances between pairs of vertices."""
     chosen, index = np.unique(ends, return_inverse=True)
     index = index.reshape(ends.shape)
-    views = collect_views(mesh, scan, poses, chosen)
+    views = list(views_by_frame(mesh, scan, poses, chosen, "uncertainty of lengths"))
     moved = point_changes(mesh, scan, poses, views, chosen, joint.factor)
     along = mesh.vertices[ends[:, 1]] - mesh.vertices[ends[:, 0]]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -538,22 +477,19 @@ def point_changes(
     mesh: Mesh,
     scan: Scan,
     poses: DevicePoses,
-    views: VertexViews,
+    views: Sequence[FrameViews],
     chosen: Int64[ndarray, "c"],
     steps: Float[ndarray, "joint k"],
 ) -> Float[ndarray, "c 3 k"]:
     """Changes of points by some steps of (delta, rho, intrinsics); NaN where no frame confirms the vertex."""
-    n, p = len(scan.frames), torch.from_numpy(mesh.vertices)
-    normal = np.zeros((len(chosen), 3, 3))
-    right = np.zeros((len(chosen), 3, steps.shape[1]))
-    for k in np.unique(views.frame).tolist():
-        vertex = views.vertex[views.frame == k]
+    p, seen = torch.from_numpy(mesh.vertices), np.zeros(len(chosen), dtype=bool)
+    normal, right = np.zeros((len(chosen), 3, 3)), np.zeros((len(chosen), 3, steps.shape[1]))
+    for k, vertex in enumerate(view.vertex for view in views):
         at = np.searchsorted(chosen, vertex)
+        seen[at] = True
         A, B = (x.numpy() for x in point_equations(devices_of(scan, poses, k), p[vertex]))
         normal[at] += A.transpose(0, 2, 1) @ A
-        mine = np.concatenate([steps[columns_of(k, n)], steps[12 * n :]])
-        right[at] += (A.transpose(0, 2, 1) @ B) @ mine
-    seen = np.isin(chosen, views.vertex)
+        right[at] += (A.transpose(0, 2, 1) @ B) @ steps[_columns(np.array([k]), len(scan.frames))]
     out = np.full_like(right, np.nan)
     out[seen] = -np.linalg.solve(normal[seen], right[seen])
     return out

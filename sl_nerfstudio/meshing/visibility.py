@@ -1,4 +1,4 @@
-"""For every vertex of a mesh, how many frames see it, and how many of them confirm or contradict it."""
+"""Which frames see, confirm or contradict each vertex of a mesh, and the part of it that they observed."""
 
 import math
 from dataclasses import dataclass, replace
@@ -128,8 +128,7 @@ def write_rows(confirmed, devices, points, normals, out):
 #
 # Where four decoded neighbours vary no more than the tangent plane of the surface predicts, their bilinear value is
 # compared. Otherwise (an edge, or undecoded neighbours) the best of nine pixels is used, each compared with the
-# prediction on the tangent plane. The surface may bend away from that plane by half of the plane's own change,
-# which is
+# prediction on the tangent plane. The surface may bend away from that plane by half of the plane's own change, which is
 # the difference between the two bounds.
 
 # A device as one row: world to device (a 3 x 4 matrix), where it is, parameters, code, width and height.
@@ -247,9 +246,7 @@ class Occluder:
         self._scene = o3d.t.geometry.RaycastingScene()
         vertices = ((mesh.vertices - self._centre) * self._scale).astype(np.float32)
         self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-        self._scene.cast_rays(
-            o3d.core.Tensor(np.zeros((1, 6), np.float32))
-        )  # builds the index, before threads share it
+        self._scene.cast_rays(o3d.core.Tensor(np.zeros((1, 6), np.float32)))  # the index, before threads share it
 
     def hidden(
         self,
@@ -393,7 +390,11 @@ def count_frames(
 
     `before` are the counts with more occluders: vertices decided there stay as they are, the others are counted again.
     """
-    counts = _begin(mesh, before)
+    begun = np.zeros((4, len(mesh.vertices)), dtype=np.int64)
+    if before is not None:
+        earlier = np.stack([before.confirmed, before.inconclusive, before.contradicted, before.near_mask])
+        begun = np.where(before.decided, earlier, 0)
+    counts = FrameCounts(*begun, residual_px=np.zeros(0))
     normals = mesh.vertex_normals()
     medians: list[float] = []
     # A frame's median must not come from doubtful vertices alone: some are checked in all frames.
@@ -414,16 +415,6 @@ def count_frames(
         counts.near_mask[vertex] += new & view.near_mask
         counts.inconclusive[vertex] += new & ~agrees & ~differs & ~view.near_mask
     return replace(counts, residual_px=np.array(medians))
-
-
-def _begin(mesh: Mesh, before: FrameCounts | None) -> FrameCounts:
-    """Zero for every vertex, except for those that are decided."""
-    if before is None:
-        counts = np.zeros((4, len(mesh.vertices)), dtype=np.int64)
-    else:
-        earlier = np.stack([before.confirmed, before.inconclusive, before.contradicted, before.near_mask])
-        counts = np.where(before.decided, earlier, 0)
-    return FrameCounts(*counts, residual_px=np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -453,14 +444,10 @@ def visible_vertices(
     mask, coords, count = frame.read_mask(), frame.read_coords(), len(lit.vertex)
     offsets, outside = np.full((count, 2), np.nan), np.empty((count, 2), np.bool_)
     packed = np.stack([packed_device(device, T) for device, T in views])
-    images = coords, mask, _grown(mask, OFF_MASK_PX)
+    images = coords, mask, np.asarray(binary_dilation(mask, np.ones((3, 3), dtype=bool), iterations=OFF_MASK_PX))
     compare_decoded(count, vertices, normals, lit.vertex, lit.uv, *images, packed, MOST_PX, offsets, outside)
     off, out = outside.T
     return VisibleVertices(lit.vertex, off, out & ~off, *offsets.T)
-
-
-def _grown(mask: Bool[ndarray, "h w"], pixels: int) -> Bool[ndarray, "h w"]:
-    return np.asarray(binary_dilation(mask, np.ones((3, 3), dtype=bool), iterations=pixels))
 
 
 # Trim a mesh to what the frames observed: the field invents the surface that closes unseen sides.

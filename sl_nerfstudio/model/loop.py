@@ -22,12 +22,12 @@ from sl_nerfstudio.console import Phase, paragraph, phase
 from sl_nerfstudio.errors import UserError, last_line
 from sl_nerfstudio.field import numba_backend
 from sl_nerfstudio.field.backend import TableGradient
-from sl_nerfstudio.field.field import FieldConfig, SDFField
+from sl_nerfstudio.field.field import MIN_RESOLUTION, FieldConfig, SDFField
 from sl_nerfstudio.field.optimiser import RowAdam
 from sl_nerfstudio.field.simd import needs_compiling
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.model.optimisers import make_recordable
-from sl_nerfstudio.model.processes import greatest, several, share_state, shared_optimizers
+from sl_nerfstudio.model.processes import SharedOptimizers, greatest, several, share_state
 from sl_nerfstudio.model.run_files import (
     INTERRUPTION,
     PARTIAL,
@@ -48,9 +48,8 @@ if TYPE_CHECKING:
 
 # The loops of a training step, compiled by another process while this one reads the scan and adjusts the poses.
 #
-# Machine code is kept on disk, so this is done once. It takes a quarter of a minute, and half of that Python's
-# lock: a
-# thread of this process would gain little.
+# Machine code is kept on disk, so this is done once. It takes a quarter of a minute, and half of that Python's lock:
+# a thread of this process would gain little.
 
 _LONGEST = 120  # seconds that `finish` waits; what is missing then is compiled here, when it is used
 _CODE = f"from {__name__} import compile_step; compile_step()"
@@ -78,7 +77,7 @@ def finish() -> None:
 def compile_step() -> None:
     """Call every loop of a step, and of evaluation, with a tiny field."""
     torch.set_num_threads(1)
-    field = SDFField(FieldConfig(levels=1, min_resolution=2, max_resolution=2, hidden=16, backend="numba"))
+    field = SDFField(FieldConfig(levels=1, max_resolution=MIN_RESOLUTION, hidden=16, backend="numba"))
     table = field.encoding.table
     p = torch.zeros(8, 3)
     value, gradient = field.sdf_and_gradient(p)
@@ -97,12 +96,10 @@ def compile_step() -> None:
 
 # Training steps recorded as a CUDA graph: one launch a step in place of thousands.
 #
-# A graph repeats the operations of the step that it was recorded from, on the same memory. What changes from step
-# to
+# A graph repeats the operations of the step that it was recorded from, on the same memory. What changes from step to
 # step must therefore be in tensors that are written before: sharpness, widths and level weights (the model's
-# buffers),
-# learning rates (`DeviceRates`), the random numbers' seeds. Where the operations themselves change, a new graph is
-# recorded.
+# buffers), learning rates (`DeviceRates`), the random numbers' seeds. Where the operations themselves change, a new
+# graph is recorded.
 
 WARM_UP = 3  # steps before a recording, so that libraries and constants are there
 
@@ -211,7 +208,9 @@ class DeviceRates:
                 group["lr"] = number
 
 
-LEAST_STEPS = 100  # between two checkpoints that are written because of the time
+# Between two checkpoints that are written because of the time.
+SECONDS_PER_SAVE = 60.0
+LEAST_STEPS = 100
 _STEPS_PER_AGREEMENT = 10  # of several processes on whether to stop: each agreement waits for all of them
 
 
@@ -220,7 +219,7 @@ class SLTrainer(Trainer):
 
     - Poses are adjusted before the first step, whose time would otherwise include it, and saved.
     - Each phase prints one line, with a bar or the time left while it runs; nerfstudio itself is quiet.
-    - A checkpoint is also written when `seconds_per_save` seconds and 100 steps have passed, and on SIGINT and SIGTERM,
+    - A checkpoint is also written when 60 seconds and 100 steps have passed, and on SIGINT and SIGTERM,
       which then end the process with status 130 or 143.
     - A checkpoint is complete or not there. Files in its folder that are no checkpoints are left alone.
     - A checkpoint that does not fit the model gives a message.
@@ -240,8 +239,10 @@ class SLTrainer(Trainer):
     def __init__(self, config: Any, local_rank: int = 0, world_size: int = 1) -> None:
         quiet_nerfstudio(not config.verbose)  # also in the processes of several GPUs
         super().__init__(config, local_rank, world_size)
-        if several() and comms.is_main_process():
-            INTERRUPTION.install()  # a process alone did so when it checked its settings
+        if several():  # a process alone did so when it checked its settings
+            INTERRUPTION.install(patient=True)
+            if config.machine.device_type == "cuda":
+                torch.cuda.set_device(local_rank)
         self._phases = ExitStack()
         self._training = Phase("train")
 
@@ -258,7 +259,7 @@ class SLTrainer(Trainer):
     def setup_optimizers(self) -> Optimizers:
         """Make the optimisers; see nerfstudio's Trainer."""
         if several():
-            return shared_optimizers(self.config.optimizers, self.pipeline.get_param_groups())
+            return SharedOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups())
         return super().setup_optimizers()
 
     def train(self) -> None:
@@ -366,7 +367,7 @@ class SLTrainer(Trainer):
         self._training.update(step + 1, self._start_step + self.config.max_num_iterations, self._fit())
         saved, when = self._saved
         since = step - (self._start_step - 1 if saved is None else saved)
-        if since >= LEAST_STEPS and time.monotonic() - when >= self.config.seconds_per_save:
+        if since >= LEAST_STEPS and time.monotonic() - when >= SECONDS_PER_SAVE:
             self.save_checkpoint(step)
         if not several():
             INTERRUPTION.release()

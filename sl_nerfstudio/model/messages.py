@@ -10,7 +10,6 @@ from sl_nerfstudio.calibration.stated import describe_change
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
 from sl_nerfstudio.model.pose_refinement import (
-    Found,
     PriorConfig,
     ScanAdjustment,
     adjusted,
@@ -31,8 +30,8 @@ class RefinedIntrinsics:
     """How intrinsics were changed; if they were not, `change` is the stated one."""
 
     change: IntrinsicsChange
-    before: Found
-    after: Found
+    before: ScanAdjustment
+    after: ScanAdjustment
     cross_validation: CrossValidation | None = None  # None where the captures do not contradict the stated intrinsics
 
     @property
@@ -42,11 +41,7 @@ class RefinedIntrinsics:
 
 
 def refine_intrinsics(
-    loaded: LoadedScan,
-    stated: IntrinsicsChange,
-    refine: RefinePoses,
-    prior: PriorConfig,
-    settings: AdjustmentSettings,
+    loaded: LoadedScan, stated: IntrinsicsChange, refine: RefinePoses, prior: PriorConfig, settings: AdjustmentSettings
 ) -> RefinedIntrinsics:
     """Change the intrinsics if the captures contradict them, adjusting all poses with each change.
 
@@ -57,7 +52,7 @@ def refine_intrinsics(
     maps, held_out = maps_and_held_out(loaded.scan, loaded.samples)
     once = replace(settings, other_minima=0)  # poses are adjusted again later
 
-    def adjusted_with(change: IntrinsicsChange) -> Found:
+    def adjusted_with(change: IntrinsicsChange) -> ScanAdjustment:
         scan = loaded.scan.with_intrinsics_change(change)
         start = scene_rig(scan, loaded.S_scene_world)
         known = pose_prior(scan, loaded.S_scene_world, prior)
@@ -82,12 +77,11 @@ def refine_intrinsics(
 
 def poses_message(found: ScanAdjustment) -> str:
     """Whether the adjusted poses were kept, in one line."""
+    assert found.cross_validation is not None
+    comparison = _comparison(found.cross_validation)
     if found.adjusted:
-        return f"Poses adjusted: {_comparison(found.cross_validation)}."
-    return (
-        "Poses NOT changed, because adjusting them hardly helped: "
-        f"{_comparison(found.cross_validation)}. The starting poses are kept."
-    )
+        return f"Poses adjusted: {comparison}."
+    return f"Poses NOT changed, because adjusting them hardly helped: {comparison}. The starting poses are kept."
 
 
 def unplaced_message(names: Sequence[str]) -> str:

@@ -1,20 +1,23 @@
 """The nerfstudio model: a signed distance field, and the poses of the devices that saw it."""
 
-from dataclasses import dataclass, field, replace
-from typing import Any
+import sys
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import torch
+import tyro
 from jaxtyping import Float
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
-from nerfstudio.models.base_model import Model
+from nerfstudio.models.base_model import Model, ModelConfig
 from numpy import ndarray
 from torch import Tensor, nn
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
-from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration, constrained
-from sl_nerfstudio.field.field import CachedGrid, SDFField
+from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses, SelfCalibration, constrained
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
+from sl_nerfstudio.field.field import CachedGrid, FieldConfig, SDFField
 from sl_nerfstudio.geometry.devices import DeviceKind, Intrinsics
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, rotate
 from sl_nerfstudio.model.messages import contradiction_message, departed_message, poses_message, unplaced_message
@@ -27,9 +30,8 @@ from sl_nerfstudio.model.outputs import (
     picture_outputs,
     ray_outputs,
 )
-from sl_nerfstudio.model.pose_refinement import adjust_scan, scene_rig, sigmas_in_scan_units
-from sl_nerfstudio.model.poses import FrameTransforms, make_pose_parameters
-from sl_nerfstudio.model.settings import SLModelSettings
+from sl_nerfstudio.model.pose_refinement import PriorConfig, adjust_scan, scene_rig, sigmas_in_scan_units
+from sl_nerfstudio.model.poses import FrameTransforms, PoseParameters, ProjectorMoves
 from sl_nerfstudio.parallel import one_torch_thread
 from sl_nerfstudio.rendering.direct_losses import (
     DecodingNoise,
@@ -38,19 +40,104 @@ from sl_nerfstudio.rendering.direct_losses import (
     field_losses,
     random_points,
 )
-from sl_nerfstudio.rendering.losses import coordinate_loss, kappa_at, level_weights_at, pattern_loss, surface_width_at
-from sl_nerfstudio.rendering.renderer import Renderer
+from sl_nerfstudio.rendering.losses import (
+    AnnealingConfig,
+    LossConfig,
+    coordinate_loss,
+    kappa_at,
+    level_weights_at,
+    pattern_loss,
+    surface_width_at,
+)
+from sl_nerfstudio.rendering.renderer import Renderer, SamplingConfig
 from sl_nerfstudio.rendering.volume_rendering import Rendered
 from sl_nerfstudio.review.verdict import departed_frames
 from sl_nerfstudio.scan import Scan
 
+RECOMMENDED_STEPS = {"sl-neus": 1000, "sl-neus-paper": 10_000}  # by method; the paper's is its own
 _REFRESH_EVERY = 20  # steps between updates of the cached grid
+
+
+@dataclass
+class SLModelConfig(ModelConfig):
+    """A signed distance field seen as projector coordinates and pattern intensity, with the poses of both devices."""
+
+    _target: type = field(default_factory=lambda: SLModel)
+    refine_poses: RefinePoses = "free"
+    """What is refined: `free` (camera and projector of every frame), `rigid-rig` (frames, and one relative pose for
+    all of them), `known-rig` (frames only), `static-projector` (frames, and a projector that never moves), `off`."""
+    pose_method: Literal["adjust", "render", "render-independently"] = "adjust"
+    """How poses are refined: `adjust` (bundle adjustment before the first step), `render` (only the rendering losses),
+    `render-independently` (the same, with each device independent of the others)."""
+    refine_intrinsics: bool = False
+    """If the captures contradict focal lengths and principal points, change these before training, provided that
+    held-out pixels then agree better; the scan folder is not changed."""
+    warm_start: float = 0.15
+    """Share of the run during which the field is only fitted to triangulated points, without rendering."""
+    sdf: FieldConfig = field(default_factory=FieldConfig)
+    """The signed distance field."""
+    losses: LossConfig = field(default_factory=LossConfig)
+    """Weights of the losses."""
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    """Samples along rays."""
+    annealing: AnnealingConfig = field(default_factory=AnnealingConfig)
+    """Sharpness and level of detail over the run."""
+    prior: PriorConfig = field(default_factory=PriorConfig)
+    """Uncertainty of the intrinsics."""
+    adjustment: AdjustmentSettings = field(default_factory=AdjustmentSettings)
+    """Settings of the bundle adjustment."""
+    schedule_iterations: tyro.conf.Suppress[int] = 1000
+    """Number of annealing steps; the trainer sets it to the length of the run."""
+    eval_num_rays_per_chunk: int = 8192
+    """Rays rendered at once outside training."""
+
+    # nerfstudio's own settings that have no meaning here; the collider must be off, rays are clipped to a unit sphere.
+    enable_collider: tyro.conf.Suppress[bool] = False
+    collider_params: tyro.conf.Suppress[dict[str, float] | None] = None
+    loss_coefficients: tyro.conf.Suppress[dict[str, float]] = field(default_factory=dict)
+    prompt: tyro.conf.Suppress[str | None] = None
+
+    @property
+    def sdf_field(self) -> FieldConfig:
+        """`sdf` under the name by which `ns-export marching-cubes` asks for it.
+
+        Only that command does. Without a GPU it would end in a traceback: here it ends with a sentence and status 1.
+        """
+        if not torch.cuda.is_available():
+            print(
+                "error: ns-export marching-cubes needs a GPU with CUDA. `sl-export --load-config config.yml --output "
+                "mesh.ply` does the same on any machine, in the scan's unit and cut to what was observed.",
+                file=sys.stderr,
+            )
+            raise SystemExit(1)
+        return self.sdf
+
+    @property
+    def adjusts_poses(self) -> bool:
+        """Whether poses are adjusted together before the first step."""
+        return self.refine_poses != "off" and self.pose_method == "adjust"
+
+    @property
+    def renders_poses(self) -> bool:
+        """Whether the rendering losses move poses."""
+        return self.refine_poses != "off" and self.pose_method != "adjust"
+
+
+def paper_model() -> SLModelConfig:
+    """The paper's model: initial sphere, independent poses by Adam, all levels, uniform samples, no direct terms."""
+    return SLModelConfig(
+        pose_method="render-independently",
+        warm_start=0.0,
+        losses=LossConfig(0.0, 0.05, 0.01, surface=0.0, free_space=0.0, coordinates_per_pixel=1000 / 65535),
+        sampling=SamplingConfig(render_rays=2024, eikonal_points=4096, strategy="uniform", samples=64),
+        annealing=AnnealingConfig("linear", coarse_to_fine=False),
+    )
 
 
 class SLModel(Model):
     """See docs/method.md. Lengths are in scene units; `poses` and `S_scene_world` convert to the scan's units."""
 
-    config: SLModelSettings
+    config: SLModelConfig
     step_now: Tensor
     kappa_now: Tensor
     surface_width_now: Tensor
@@ -62,7 +149,7 @@ class SLModel(Model):
     intrinsics_change: Tensor
 
     def __init__(
-        self, config: SLModelSettings, scene_box: SceneBox, num_train_data: int, metadata: dict[str, Any], **kwargs: Any
+        self, config: SLModelConfig, scene_box: SceneBox, num_train_data: int, metadata: dict[str, Any], **kwargs: Any
     ) -> None:
         self.scan: Scan = metadata["sl_scan"]
         self.S_scene_world: Similarity = metadata["sl_S_scene_world"]
@@ -75,7 +162,7 @@ class SLModel(Model):
         self.cache = CachedGrid()
         self._cache_is_old = False  # True after a checkpoint was loaded for inspection
         rig = scene_rig(self.scan, self.S_scene_world)
-        self.device_poses = make_pose_parameters(self.config, rig.T_world_camera, rig.T_world_projector)
+        self.device_poses = pose_parameters(self.config, rig.T_world_camera, rig.T_world_projector)
         self.measured = MeasuredCoordinates(self.scan)
         projector = Intrinsics.of(self.scan.projector)
         self._projector_kind: DeviceKind = projector.model
@@ -201,7 +288,7 @@ class SLModel(Model):
         if c.renders_poses:
             rig = constrained(c.refine_poses, rig)
         self.device_poses.rebase(rig.T_world_camera, rig.T_world_projector)
-        said.append(departed_message(departed_frames(self.scan, self.poses(), c.prior.frame_rotation_deg)))
+        said.append(departed_message(departed_frames(self.scan, self.poses())))
         return "\n".join(filter(None, said))
 
     def measure_noise(self, samples: Any) -> None:
@@ -231,7 +318,7 @@ class SLModel(Model):
         """What steps read on their device, and what the host knows of it."""
         c = self.config
         self._step = step
-        self.kappa_now.fill_(kappa_at(c.annealing, step, c.schedule_iterations))
+        self.kappa_now.fill_(kappa_at(c.annealing.kappa, step, c.schedule_iterations))
         if c.losses.direct:
             self.surface_width_now.fill_(surface_width_at(step, c.schedule_iterations))
 
@@ -383,6 +470,27 @@ class SLModel(Model):
         return image_metrics_and_images(outputs, batch)
 
 
+def pose_parameters(
+    config: SLModelConfig, T_scene_camera: Float[Tensor, "frames 4 4"], T_scene_projector: Float[Tensor, "frames 4 4"]
+) -> PoseParameters:
+    """The parameters for what is free (`refine_poses`) and how it is refined (`pose_method`)."""
+    free, independent = config.refine_poses, config.pose_method == "render-independently"
+    moves: ProjectorMoves = "relative pose"
+    if free == "static-projector":
+        moves = "nothing"
+    elif independent and free not in ("known-rig", "rigid-rig"):
+        moves = "own pose"
+    return PoseParameters(
+        T_scene_camera,
+        T_scene_projector,
+        refine=config.renders_poses,
+        refine_projector=free not in ("known-rig", "static-projector"),
+        shared_projector=free == "rigid-rig",
+        about_scene=free == "static-projector" or not independent,
+        projector_moves_by=moves,
+    )
+
+
 def _read_step(model: SLModel, _: object) -> None:
     """After a checkpoint was loaded."""
     model._set_scalars(int(model.step_now))
@@ -392,30 +500,3 @@ def _corrected(bundle: RayBundle, views: Tensor, now: FrameTransforms) -> tuple[
     """Move rays from the starting pose, at which they were made, to the current one."""
     directions = rotate(now.correction[views], bundle.directions)
     return now.camera_centre[views], directions / directions.norm(dim=-1, keepdim=True)
-
-
-# The configuration from which nerfstudio creates the model, and that of the paper's method.
-
-
-@dataclass
-class SLModelConfig(SLModelSettings):
-    """A signed distance field seen as projector coordinates and pattern intensity, with the poses of both devices."""
-
-    _target: type = field(default_factory=lambda: SLModel)
-
-
-def paper_model() -> SLModelConfig:
-    """The paper's model: initial sphere, independent poses by Adam, all levels, uniform samples, no direct terms."""
-    c = SLModelConfig(pose_method="render-independently", warm_start=0.0)
-    losses = replace(
-        c.losses,
-        coordinates=0.0,
-        coordinates_per_pixel=1000 / 65535,
-        pattern=0.05,
-        eikonal=0.01,
-        surface=0.0,
-        free_space=0.0,
-    )
-    sampling = replace(c.sampling, strategy="uniform", samples=64, render_rays=2024, eikonal_points=4096)
-    annealing = replace(c.annealing, kappa_start=32.0, kappa_end=200.0, kappa_growth="linear", coarse_to_fine=False)
-    return replace(c, losses=losses, sampling=sampling, annealing=annealing)

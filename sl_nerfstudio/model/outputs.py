@@ -2,20 +2,80 @@
 
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from torch import Tensor, nn
 
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
+from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.dataparser.dataparser import PixelSamples
 from sl_nerfstudio.geometry.devices import Intrinsics, project
-from sl_nerfstudio.geometry.lie import inverse, transform
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, transform
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, evenly_spaced
 from sl_nerfstudio.geometry.triangulation import epipolar_residual, triangulate
 from sl_nerfstudio.rendering.direct_losses import DecodingNoise
 from sl_nerfstudio.rendering.renderer import Ends, Renderer
 from sl_nerfstudio.scan import Scan
+
+
+@runtime_checkable
+class TrainedModel(Protocol):
+    """What viewer and export need of a model; the field is in the scene frame."""
+
+    scan: Scan
+    S_scene_world: Similarity
+    viewed_frame: int  # whose projector lights what is rendered from a free viewpoint
+
+    @property
+    def step(self) -> int:
+        """The step of the training."""
+        ...
+
+    @property
+    def cell(self) -> float:
+        """Length of the field's finest cells, in the scan's unit."""
+        ...
+
+    @property
+    def device(self) -> torch.device:
+        """Where the field is evaluated."""
+        ...
+
+    def sdf(self, p_scene: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        """Signed distance in scene units."""
+        ...
+
+    def poses(self) -> DevicePoses:
+        """Current poses of cameras and projectors in the scan's world and unit."""
+        ...
+
+    def poses_scene(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
+        """Current poses of cameras and projectors in the scene."""
+        ...
+
+    def pose_sigma(self) -> Float[ndarray, "frames 4"] | None:
+        """One sigma of each frame's poses, in the order of PoseSigma's fields; None if it was not estimated."""
+        ...
+
+    def joint_covariance(self) -> JointCovariance | None:
+        """Covariance of all poses and the intrinsics in the scan's world and unit; None if it was not estimated."""
+        ...
+
+    def unplaced(self) -> list[bool]:
+        """Of each frame, whether it does not agree with the others."""
+        ...
+
+    def self_calibration(self) -> SelfCalibration | None:
+        """How well the intrinsics agree with the captures; None where poses were not adjusted."""
+        ...
+
+    def history(self) -> dict[str, list[float]]:
+        """Convergence curves, with the steps under `step`."""
+        ...
+
 
 # Decoded coordinates looked up at scene points, for the residual image in the viewer.
 
@@ -56,10 +116,7 @@ _LEAST_PX = 0.02  # smallest plausible noise, pattern pixels
 
 @torch.no_grad()
 def measure_decoding(
-    scan: Scan,
-    samples: PixelSamples,
-    T_scene_camera: Float[Tensor, "n 4 4"],
-    T_scene_projector: Float[Tensor, "n 4 4"],
+    scan: Scan, samples: PixelSamples, T_scene_camera: Float[Tensor, "n 4 4"], T_scene_projector: Float[Tensor, "n 4 4"]
 ) -> DecodingNoise:
     """Robust 1 sigma of the epipolar residual, and the median slope of coordinates along camera rays."""
     residuals, slopes = [], []

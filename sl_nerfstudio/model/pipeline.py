@@ -37,7 +37,7 @@ class SLPipelineConfig(VanillaPipelineConfig):
 
     _target: type = field(default_factory=lambda: SLPipeline)
     scan_fingerprint: tyro.conf.Suppress[str | None] = None
-    """Which scan the run was trained on, set when the run begins; see training/fingerprints.py."""
+    """Which scan the run was trained on, set when the run begins."""
     settings_fingerprint: tyro.conf.Suppress[str | None] = None
     """With which settings, likewise; the checkpoints of a run have the same two."""
 
@@ -57,9 +57,9 @@ class SLPipeline(VanillaPipeline):
       uninterrupted one would.
     - Evaluation uses held-out pixels of every frame, not whole images that were used for training.
     - After a checkpoint is loaded for viewing or export, cameras are at their refined poses.
-    - The viewer shows the scan (viewer/), and at the end of training the next commands are printed.
-    - On a GPU, kernels compute the losses of a step (kernel_step.py).
-    - Several processes average their gradients without DistributedDataParallel (training/shared_training.py).
+    - The viewer shows the scan (viewer.py), and at the end of training the next commands are printed.
+    - On a GPU, kernels compute the losses of a step (warp_step.py).
+    - Several processes average their gradients without DistributedDataParallel (processes.py).
     """
 
     config: SLPipelineConfig

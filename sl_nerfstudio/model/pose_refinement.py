@@ -47,42 +47,38 @@ from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan import Scan, measured_length
 
 _STEP = 1e-5  # scene units and radian, of central differences
+# 1 sigma of starting poses, besides USUAL_FRAME_ROTATION_DEG, if the scan does not state it in `sl_pose_sigma`.
+FRAME_TRANSLATION = 0.1  # position of a frame's part of the surface, as a share of the object's radius
+RELATIVE_ROTATION_DEG = 0.3  # orientation of the projector relative to the camera
+RELATIVE_TRANSLATION = 0.05  # position of the projector relative to the camera, as a share of the baseline
 _LEAST_SIGMA = 1e-9  # scene units and radian: for poses that are known exactly; keeps the equations solvable
 
 
 @dataclass
 class PriorConfig:
-    """1 sigma of intrinsics, and of starting poses if the scan does not state it in `sl_pose_sigma`."""
+    """How well the intrinsics are known."""
 
-    frame_rotation_deg: float = USUAL_FRAME_ROTATION_DEG
-    """Orientation of a frame in the world, in degrees."""
-    frame_translation: float = 0.1
-    """Position of a frame's part of the surface, as a share of the object's radius."""
-    relative_rotation_deg: float = 0.3
-    """Orientation of the projector relative to the camera, in degrees."""
-    relative_translation: float = 0.05
-    """Position of the projector relative to the camera, as a share of the baseline."""
     intrinsics: float = INTRINSICS_SIGMA
-    """Focal lengths and principal points of both devices, as a share of the focal length; they increase the stated
-    uncertainty of the poses."""
+    """1 sigma of focal lengths and principal points of both devices, as a share of the focal length; it increases the
+    stated uncertainty of the poses."""
 
 
 @dataclass(frozen=True)
 class ScanAdjustment:
-    """Adjusted poses in the scene frame, or the starting ones if adjusting did not help."""
+    """Adjusted poses in the scene frame and the scan's gauge, or the starting ones if adjusting did not help."""
 
     rig: Rig  # "world" is the scene
     sigma: Float[Tensor, "frames 12"]
     factor: Float[Tensor, "joint k"]  # of the covariance of all poses and the intrinsics, see JointCovariance
-    cross_validation: CrossValidation
     noise_px: float
-    intrinsics: SelfCalibration | None = None  # None where nothing was adjusted
-    unplaced: tuple[int, ...] = ()  # frames that do not agree with the others
+    intrinsics: SelfCalibration | None  # None where nothing was adjusted
+    unplaced: tuple[int, ...]  # frames that do not agree with the others
+    cross_validation: CrossValidation | None = None  # None before it was done
 
     @property
     def adjusted(self) -> bool:
         """Whether `rig` is the adjusted one."""
-        return self.cross_validation.better
+        return self.cross_validation is None or self.cross_validation.better
 
 
 def scene_rig(scan: Scan, S_scene_world: Similarity) -> Rig:
@@ -92,27 +88,16 @@ def scene_rig(scan: Scan, S_scene_world: Similarity) -> Rig:
 
 def pose_prior(scan: Scan, S_scene_world: Similarity, config: PriorConfig) -> PosePrior:
     """Uncertainty of each frame's starting pose, as stated or else by default; in scene units and radian."""
-    rows = []
-    for frame, length in zip(scan.frames, scan.poses.baseline * S_scene_world.scale, strict=True):
+    scale, rows = S_scene_world.scale, []
+    for frame, length in zip(scan.frames, scan.poses.baseline * scale, strict=True):
         stated = frame.pose_sigma
         if stated is None:
-            rows.append(
-                (
-                    config.frame_translation,
-                    np.radians(config.frame_rotation_deg),
-                    config.relative_translation * length,
-                    np.radians(config.relative_rotation_deg),
-                )
-            )
+            frame_sigma, relative_sigma = FRAME_TRANSLATION, RELATIVE_TRANSLATION * length
+            angles = USUAL_FRAME_ROTATION_DEG, RELATIVE_ROTATION_DEG
         else:
-            rows.append(
-                (
-                    stated.camera_translation * S_scene_world.scale,
-                    np.radians(stated.camera_rotation_deg),
-                    stated.relative_translation * S_scene_world.scale,
-                    np.radians(stated.relative_rotation_deg),
-                )
-            )
+            frame_sigma, relative_sigma = stated.camera_translation * scale, stated.relative_translation * scale
+            angles = stated.camera_rotation_deg, stated.relative_rotation_deg
+        rows.append((frame_sigma, np.radians(angles[0]), relative_sigma, np.radians(angles[1])))
     sigma = torch.tensor(np.maximum(np.array(rows), _LEAST_SIGMA), dtype=torch.float64)
     a, b, c, d = sigma.unbind(1)
     return PosePrior(a, b, c, d, config.intrinsics, scan.intrinsics_change)
@@ -133,27 +118,13 @@ def adjust_scan(
     found = adjusted(scan, S_scene_world, start, maps, refine, stated, settings)
     decision = cross_validate(start, found.rig, held_out, maps, found.noise_px)
     if decision.better:
-        return ScanAdjustment(
-            found.rig, found.sigma, found.factor, decision, found.noise_px, found.intrinsics, found.unplaced
-        )
+        return replace(found, cross_validation=decision)
     nothing_learnt = decision.worse or refine == "off"
     sigma, factor = (stated.sigma, joint_of_prior(stated, start)) if nothing_learnt else _known_by_both(start, found)
-    return ScanAdjustment(start, sigma, factor, decision, found.noise_px, found.intrinsics, found.unplaced)
+    return replace(found, rig=start, sigma=sigma, factor=factor, cross_validation=decision)
 
 
-@dataclass(frozen=True)
-class Found:
-    """An adjustment in the scan's gauge, before cross-validation."""
-
-    rig: Rig
-    sigma: Float[Tensor, "frames 12"]
-    factor: Float[Tensor, "joint k"]  # of the covariance of all poses and the intrinsics, see JointCovariance
-    noise_px: float
-    intrinsics: SelfCalibration | None
-    unplaced: tuple[int, ...]  # frames that do not agree with the others
-
-
-def _known_by_both(start: Rig, found: Found) -> tuple[Float[Tensor, "frames 12"], Float[Tensor, "joint k"]]:
+def _known_by_both(start: Rig, found: ScanAdjustment) -> tuple[Float[Tensor, "frames 12"], Float[Tensor, "joint k"]]:
     """Uncertainty of starting poses with which the captures agree as well as with the adjusted ones.
 
     They may be wrong by as much as the adjusted ones, and by as much as the two differ.
@@ -173,8 +144,8 @@ def adjusted(
     refine: RefinePoses,
     prior: PosePrior,
     settings: AdjustmentSettings,
-) -> Found:
-    """Adjust the scan's poses from `start`, and restore the scan's lengths."""
+) -> ScanAdjustment:
+    """Adjust the scan's poses from `start`, and restore the scan's lengths; not cross-validated."""
     begin = constrained(refine, start)
     found: Adjustment = adjust(begin, maps, prior, refine, settings)
     # a frame whose starting pose proved to be wrong must not turn or stretch the scene
@@ -184,7 +155,7 @@ def adjusted(
     rig = restore(start, found.rig, _scale(scan, S_scene_world, refine, start, found.rig, prior))
     factor = torch.from_numpy(JointCovariance(found.factor.numpy()).mapped(_motion(found.rig, rig)).factor)
     known = known_length(scan, S_scene_world, refine, rig, prior)
-    return Found(
+    return ScanAdjustment(
         rig, found.sigma, with_known_length(factor, rig, known), found.noise_px, found.intrinsics, found.unplaced
     )
 

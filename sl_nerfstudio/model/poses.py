@@ -1,12 +1,6 @@
-"""Poses of all devices as parameters, in the scene frame.
+"""Poses of all devices as parameters, in the scene frame: increments to a base.
 
-`RigPoseParameters`: a frame moves as a whole, and its projector moves relative to its camera.
-`StaticProjectorParameters`: cameras move, their projector does not.
-`IndependentPoseParameters` (the paper's): camera and projector of a frame move independently of each other.
-`CoupledPoseParameters`: each camera moves independently; the relative pose of its projector is known or shared by all.
-
-All start from a *base* that may be replaced (by the bundle adjustment) before training continues; the parameters are
-increments to it.
+The bundle adjustment may replace the base before training continues.
 """
 
 from collections.abc import Sequence
@@ -20,7 +14,6 @@ from torch import Tensor, nn
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance, as_stored, stored_columns
 from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, SelfCalibration
 from sl_nerfstudio.geometry.lie import exp_se3, inverse
-from sl_nerfstudio.model.settings import SLModelSettings
 
 ProjectorMoves = Literal["nothing", "relative pose", "own pose"]
 
@@ -38,11 +31,6 @@ class FrameTransforms:
 class PoseParameters(nn.Module):
     """Base poses (float64 buffers, saved with the weights) and increments to them."""
 
-    about_scene = True
-    """Whether cameras turn about the scene's centre; otherwise about their own."""
-    projector_moves_by: ProjectorMoves = "relative pose"
-    """What the projector's increment changes."""
-
     start_camera: Tensor
     start_projector: Tensor
     base_camera: Tensor
@@ -57,11 +45,19 @@ class PoseParameters(nn.Module):
         self,
         T_scene_camera: Float[Tensor, "frames 4 4"],
         T_scene_projector: Float[Tensor, "frames 4 4"],
-        refine_camera: bool,
-        refine_projector: bool,
+        refine: bool,
+        refine_projector: bool = True,
         shared_projector: bool = False,
+        about_scene: bool = True,
+        projector_moves_by: ProjectorMoves = "relative pose",
     ) -> None:
+        """Parameters that the losses move if `refine`.
+
+        Cameras turn about the scene's centre, or each about its own. `projector_moves_by` is what the projector's
+        increment changes, and `shared_projector` makes it one increment for all frames.
+        """
         super().__init__()
+        self.about_scene, self.projector_moves_by = about_scene, projector_moves_by
         for name, T in (("camera", T_scene_camera), ("projector", T_scene_projector)):
             self.register_buffer(f"start_{name}", T.double().clone())
             self.register_buffer(f"base_{name}", T.double().clone())
@@ -77,8 +73,10 @@ class PoseParameters(nn.Module):
         joint = torch.full((size, stored_columns(size)), float("nan"), dtype=torch.float64)
         self.register_buffer("joint_factor", joint)
         self.register_buffer("unplaced", torch.zeros(n, dtype=torch.bool))  # frames that disagree with the others
-        self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine_camera)
-        self.projector_step = nn.Parameter(torch.zeros(1 if shared_projector else n, 6), requires_grad=refine_projector)
+        self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine)
+        self.projector_step = nn.Parameter(
+            torch.zeros(1 if shared_projector else n, 6), requires_grad=refine and refine_projector
+        )
         self._fixed: FrameTransforms | None = None
         self.register_load_state_dict_post_hook(_forget)
 
@@ -123,7 +121,14 @@ class PoseParameters(nn.Module):
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """`T_scene_camera` and `T_scene_projector` of all frames, float64, differentiable."""
-        raise NotImplementedError
+        step = exp_se3(self.camera_step.double())
+        camera = step @ self.base_camera if self.about_scene else self.base_camera @ step
+        if self.projector_moves_by == "nothing":
+            return camera, self.base_projector
+        step = exp_se3(self.projector_step.double())
+        if self.projector_moves_by == "own pose":
+            return camera, self.base_projector @ step
+        return camera, camera @ (step @ inverse(self.base_camera) @ self.base_projector)
 
     def transforms(self) -> FrameTransforms:
         """The current poses as rays need them, differentiable; computed once if no losses move the poses."""
@@ -143,83 +148,7 @@ class PoseParameters(nn.Module):
         self._fixed = None  # torch moves parameters and buffers to another device
         return super()._apply(fn, recurse)
 
-    def _camera_about_scene(self) -> Float[Tensor, "frames 4 4"]:
-        return exp_se3(self.camera_step.double()) @ self.base_camera
-
-    def _camera_about_itself(self) -> Float[Tensor, "frames 4 4"]:
-        return self.base_camera @ exp_se3(self.camera_step.double())
-
-    def _relative(self) -> Float[Tensor, "frames 4 4"]:
-        return exp_se3(self.projector_step.double()) @ inverse(self.base_camera) @ self.base_projector
-
 
 def _forget(parameters: PoseParameters, _: object) -> None:
     """After a checkpoint was loaded."""
     parameters._fixed = None
-
-
-class RigPoseParameters(PoseParameters):
-    """`T_scene_camera = exp(delta) base` and `T_camera_projector = exp(rho) base`.
-
-    delta rotates about the scene's centre.
-    """
-
-    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
-        """See PoseParameters."""
-        camera = self._camera_about_scene()
-        return camera, camera @ self._relative()
-
-
-class StaticProjectorParameters(PoseParameters):
-    """`T_scene_camera = exp(delta) base`, and a projector that does not move."""
-
-    projector_moves_by = "nothing"
-
-    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
-        """See PoseParameters."""
-        return self._camera_about_scene(), self.base_projector
-
-
-class IndependentPoseParameters(PoseParameters):
-    """`T = base exp(xi)` for camera and projector separately: each rotates about its own centre."""
-
-    about_scene = False
-    projector_moves_by = "own pose"
-
-    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
-        """See PoseParameters."""
-        return self._camera_about_itself(), self.base_projector @ exp_se3(self.projector_step.double())
-
-
-class CoupledPoseParameters(PoseParameters):
-    """`T_scene_camera = base exp(xi)`: cameras rotate about their own centres, and their projectors move with them."""
-
-    about_scene = False
-
-    def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
-        """See PoseParameters."""
-        camera = self._camera_about_itself()
-        return camera, camera @ self._relative()
-
-
-def make_pose_parameters(
-    settings: SLModelSettings,
-    T_scene_camera: Float[Tensor, "frames 4 4"],
-    T_scene_projector: Float[Tensor, "frames 4 4"],
-) -> PoseParameters:
-    """The parameters for what is free (`refine_poses`) and how it is refined (`pose_method`)."""
-    free, independent = settings.refine_poses, settings.pose_method == "render-independently"
-    if free == "static-projector":
-        kind = StaticProjectorParameters
-    elif not independent:
-        kind = RigPoseParameters
-    else:
-        kind = CoupledPoseParameters if free in ("known-rig", "rigid-rig") else IndependentPoseParameters
-    moves = settings.renders_poses
-    return kind(
-        T_scene_camera,
-        T_scene_projector,
-        refine_camera=moves,
-        refine_projector=moves and free not in ("known-rig", "static-projector"),
-        shared_projector=free == "rigid-rig",
-    )

@@ -340,12 +340,16 @@ class Interruption:
         self._received: int | None = None
         self._raised = False
         self._held = False
+        self._patient = False
 
-    def install(self) -> None:
-        """Handle the signals from now on. A signal that the process was started to ignore remains ignored."""
+    def install(self, patient: bool = False) -> None:
+        """Handle the signals from now on. A signal that the process was started to ignore remains ignored.
+
+        A `patient` process also survives the second signal: it may come from the process that started it.
+        """
         if self._previous or threading.current_thread() is not threading.main_thread():
             return
-        self._received, self._raised, self._held = None, False, False
+        self._received, self._raised, self._held, self._patient = None, False, False, patient
         for number in _SIGNALS:
             before = signal.getsignal(number)
             if before is not signal.SIG_IGN:
@@ -395,6 +399,8 @@ class Interruption:
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self._received is not None:
+            if self._patient:
+                return
             os._exit(128 + number)
         self._received = number
         said = b"terminated\n" if number == signal.SIGTERM else b"interrupted\n"

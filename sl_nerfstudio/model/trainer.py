@@ -1,4 +1,4 @@
-"""Checks before training starts: faults are found before anything is written."""
+"""What `ns-train` is asked for, and what is checked before it starts: faults are found before anything is written."""
 
 import shlex
 import sys
@@ -23,7 +23,6 @@ from sl_nerfstudio.model.messages import refine_intrinsics, refined_intrinsics_m
 from sl_nerfstudio.model.model import SLModelConfig
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
-from sl_nerfstudio.model.processes import launch_well
 from sl_nerfstudio.model.run_files import (
     CONFIG,
     INTERRUPTION,
@@ -37,7 +36,6 @@ from sl_nerfstudio.model.run_files import (
     require_unused,
     settings_fingerprint,
 )
-from sl_nerfstudio.parallel import cores
 from sl_nerfstudio.scan import require_valid
 from sl_nerfstudio.storage import write_atomic
 
@@ -53,8 +51,6 @@ class SLTrainerConfig(TrainerConfig):
     schedule_iterations: int | None = None
     """Number of steps over which learning rates decay and annealing takes place: by default --max-num-iterations, or
     for a resumed run the length of the run that it resumes."""
-    seconds_per_save: float = 60.0
-    """A checkpoint is also written when this many seconds, and at least 100 steps, have passed since the last one."""
     cuda_graph: bool = True
     """On a GPU, record the operations of a step once and repeat them with one launch; off: launch each by itself."""
     tf32: bool = False
@@ -70,7 +66,12 @@ class SLTrainerConfig(TrainerConfig):
             quiet_nerfstudio(not self.verbose)
 
     def set_timestamp(self) -> None:
-        """Check the run and take its folder; nerfstudio calls this first, before it writes anything.
+        """Prepare the run: nerfstudio calls this first, before it writes anything, and has no other place for it."""
+        super().set_timestamp()
+        self.prepare_run()
+
+    def prepare_run(self) -> None:
+        """Check everything that can be wrong, complete the settings, and take the run's folder.
 
         An error that the user can fix is printed without a traceback and ends the process with status 1.
         """
@@ -78,12 +79,8 @@ class SLTrainerConfig(TrainerConfig):
         quiet_nerfstudio(not self.verbose)
         if self.machine.num_devices * self.machine.num_machines == 1:
             INTERRUPTION.install()
-        else:
-            launch_well()
         try:
-            begun = self._continue() if self.last_step is not None else self.prepare()
-            super().set_timestamp()
-            self._take_folder(begun)
+            self._take_folder(self._continue() if self.last_step is not None else self.prepare())
         except UserError as error:
             INTERRUPTION.remove()
             print(f"error: {error}", file=sys.stderr)
@@ -271,16 +268,20 @@ def _require_devices(machine: MachineConfig) -> None:
             "--machine.device-type mps: Apple's GPUs do not compute in float64, which the poses need. "
             "Leave the option out to train on the CPU."
         )
-    available = {"cpu": cores(), "cuda": torch.cuda.device_count()}
-    if not available[kind]:
+    available = {"cpu": 1, "cuda": torch.cuda.device_count()}[kind]
+    if not available:
         raise UserError(
             f"--machine.device-type {kind}: torch {torch.__version__} finds no such device on this machine. "
             "Leave the option out to train on an available device."
         )
-    if not 1 <= count <= available[kind]:
-        unit = "cores" if kind == "cpu" else f"devices of type {kind}"
+    if kind == "cpu" and count * machine.num_machines != 1:
         raise UserError(
-            f"--machine.num-devices {count}: this machine has {available[kind]} {unit}; give 1 to that many"
+            f"--machine.num-devices {count}: several processes are for several GPUs. "
+            "Leave the option out: on the CPU one process uses all cores."
+        )
+    if not 1 <= count <= available:
+        raise UserError(
+            f"--machine.num-devices {count}: this machine has {available} devices of type {kind}; give 1 to that many"
         )
 
 

@@ -10,7 +10,6 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import matplotlib
 import numpy as np
@@ -24,15 +23,14 @@ from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
-from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, transform
+from sl_nerfstudio.geometry.lie import inverse, transform
 from sl_nerfstudio.geometry.triangulation import Viewpoint, beside, far_enough, triangulate
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 from sl_nerfstudio.meshing.uncertainty import vertex_uncertainty
-from sl_nerfstudio.model.outputs import coordinate_colours
+from sl_nerfstudio.model.outputs import TrainedModel, coordinate_colours
 from sl_nerfstudio.scan import Scan
 
 # Lines as thin rods: one mesh for any number of them, where the viewer has no line segments.
@@ -68,24 +66,16 @@ _STARTING_SIZE = 0.8  # of the current ones
 _ROD = 0.02  # radius of the line from start to current pose, as a share of a pyramid's size
 
 
-@dataclass(frozen=True)
-class DeviceKind:
-    """What cameras, or projectors, have in common in the scene."""
-
-    name: str
-    colour: Colour
-
-
-CAMERA, PROJECTOR = DeviceKind("camera", (90, 160, 255)), DeviceKind("projector", (255, 140, 40))
+COLOURS: dict[str, Colour] = {"camera": (90, 160, 255), "projector": (255, 140, 40)}
 
 
 class DeviceNodes:
-    """The nodes of all devices of one kind, one of each frame; poses are in the scene."""
+    """Nodes of the cameras, or of the projectors, one of each frame; poses are in the scene."""
 
     def __init__(
         self,
         scene: viser.SceneApi,
-        kind: DeviceKind,
+        kind: str,
         names: Sequence[str],
         devices: Sequence[Device],
         start: Float64[ndarray, "n 4 4"],
@@ -99,7 +89,7 @@ class DeviceNodes:
         self.start, self.current = start, current
         self.unplaced = [False] * len(names)
         self.starting = [
-            scene.add_camera_frustum(f"/starting/{kind.name}/{name}", *shape, _STARTING_SIZE * scale, color=GREY)
+            scene.add_camera_frustum(f"/starting/{kind}/{name}", *shape, _STARTING_SIZE * scale, color=GREY)
             for name, shape in zip(names, self._shapes, strict=True)
         ]
         for handle, T in zip(self.starting, start, strict=True):
@@ -111,8 +101,8 @@ class DeviceNodes:
 
     def _current_nodes(self, k: int) -> tuple[viser.CameraFrustumHandle, viser.LabelHandle]:
         """The pyramid and the name of a frame's device at its current pose; they replace those that are there."""
-        kind, lost, path = self._kind.name, self.unplaced[k], f"{self._kind.name}/{self._names[k]}"
-        colour = UNPLACED_COLOUR if lost else self._kind.colour
+        kind, lost, path = self._kind, self.unplaced[k], f"{self._kind}/{self._names[k]}"
+        colour = UNPLACED_COLOUR if lost else COLOURS[kind]
         pyramid = self._scene.add_camera_frustum(
             f"/refined/{path}", *self._shapes[k], self._scale, color=colour, image=self._image
         )
@@ -152,7 +142,7 @@ class DeviceNodes:
     def _drawn_path(self) -> viser.MeshHandle:
         ends = np.stack([self.start[:, :3, 3], self.current[:, :3, 3]], 1) * VISER_NERFSTUDIO_SCALE_RATIO
         vertices, faces = rods(ends, _ROD * self._scale)
-        return add_rods(self._scene, f"/moved/{self._kind.name}", vertices, faces, self._kind.colour)
+        return add_rods(self._scene, f"/moved/{self._kind}", vertices, faces, COLOURS[self._kind])
 
 
 def add_rods(
@@ -185,10 +175,7 @@ _FARTHEST = 3.0  # from the object's centre, scene units, whose radius is 0.8: r
 
 
 def pattern_rays(
-    scan: Scan,
-    frame: int,
-    T_scene_camera: Float[Tensor, "4 4"],
-    T_scene_projector: Float[Tensor, "4 4"],
+    scan: Scan, frame: int, T_scene_camera: Float[Tensor, "4 4"], T_scene_projector: Float[Tensor, "4 4"]
 ) -> tuple[Float64[ndarray, "n 2 3"], Float64[ndarray, "n 2 3"]]:
     """Segments from the camera, and from the projector, to where the two rays meet; in the scene.
 
@@ -221,53 +208,6 @@ def _evenly(decoded: ndarray) -> tuple[ndarray, ndarray]:
         step += 1
 
 
-# What the viewer needs of a model.
-
-
-@runtime_checkable
-class ViewedModel(Protocol):
-    """A model that is trained, or was loaded."""
-
-    scan: Scan
-    S_scene_world: Similarity
-    viewed_frame: int  # whose projector lights what is rendered from a free viewpoint
-
-    @property
-    def step(self) -> int:
-        """The step of the training."""
-        ...
-
-    @property
-    def device(self) -> torch.device:
-        """Where the field is evaluated."""
-        ...
-
-    @property
-    def cell(self) -> float:
-        """Length of the field's finest cells, in the scan's unit."""
-        ...
-
-    def sdf(self, p_scene: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Signed distance in scene units."""
-        ...
-
-    def poses(self) -> DevicePoses:
-        """Current poses in the scan's world and unit."""
-        ...
-
-    def poses_scene(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
-        """Current poses of cameras and projectors in the scene."""
-        ...
-
-    def joint_covariance(self) -> JointCovariance | None:
-        """Covariance of all poses and the intrinsics in the scan's world and unit; None if it was not estimated."""
-        ...
-
-    def unplaced(self) -> list[bool]:
-        """Of each frame, whether it does not agree with the others."""
-        ...
-
-
 # The surface of the field as a mesh for the viewer, and what it can be coloured by.
 
 RENDERED = "as rendered"
@@ -288,7 +228,7 @@ class Coloured:
 class ViewerSurface:
     """The zero level of a model's field at one step; lengths in the scene, values in the scan's unit."""
 
-    def __init__(self, model: ViewedModel, resolution: int = RESOLUTION) -> None:
+    def __init__(self, model: TrainedModel, resolution: int = RESOLUTION) -> None:
         """Raises UserError if there is no surface."""
         self._model = model
         self.step = model.step
@@ -455,7 +395,7 @@ class SceneView(ViewerControl):
     nerfstudio finds the object as an attribute of the pipeline and calls `_setup`, in training and in `ns-viewer`.
     """
 
-    def __init__(self, model: ViewedModel) -> None:
+    def __init__(self, model: TrainedModel) -> None:
         self._model = model
         self._devices: tuple[DeviceNodes, DeviceNodes] | None = None
         self._surface: ViewerSurface | None = None
@@ -479,8 +419,8 @@ class SceneView(ViewerControl):
         scene, pattern = self.viser_server.scene, _thumbnail(scan.read_pattern())
         devices = [frame.camera for frame in scan.frames], [scan.projector] * len(names)
         self._devices = (
-            DeviceNodes(scene, CAMERA, names, devices[0], cameras, current[0], self._scale),
-            DeviceNodes(scene, PROJECTOR, names, devices[1], projectors, current[1], self._scale, pattern),
+            DeviceNodes(scene, "camera", names, devices[0], cameras, current[0], self._scale),
+            DeviceNodes(scene, "projector", names, devices[1], projectors, current[1], self._scale, pattern),
         )
         self._mark_unplaced()
         self.panel = Panel(self.viser_server, names, viewer.trainer is not None, self._changed)
@@ -529,10 +469,10 @@ class SceneView(ViewerControl):
             return
         frame, (camera, projector) = self.panel.chosen_frame, self._model.poses_scene()
         segments = pattern_rays(self._model.scan, frame, camera[frame], projector[frame])
-        for kind, ends in zip((CAMERA, PROJECTOR), segments, strict=True):
+        for kind, ends in zip(COLOURS, segments, strict=True):
             drawn = rods(ends * VISER_NERFSTUDIO_SCALE_RATIO, _RAY * self._scale)
-            name = f"/rays/{kind.name}"
-            self._nodes[name] = add_rods(self.viser_server.scene, name, *drawn, kind.colour)
+            name = f"/rays/{kind}"
+            self._nodes[name] = add_rods(self.viser_server.scene, name, *drawn, COLOURS[kind])
 
     def show_surface(self) -> None:
         """Draw the surface as a mesh in the chosen colours, or leave it to the rendered picture."""

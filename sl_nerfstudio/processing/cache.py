@@ -1,6 +1,5 @@
-"""The work folder: one run at a time works in it, and no temporary file stays."""
+"""The work folder: results of stages that the next run takes up, held by one run at a time."""
 
-import hashlib
 import platform
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,13 +9,12 @@ from pathlib import Path
 from typing import Any, TypeVar
 from zipfile import BadZipFile
 
-import sl_nerfstudio
 from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.processing.consistency import ConsistentFrames
-from sl_nerfstudio.processing.records import DECODED, decode, digest, encode
+from sl_nerfstudio.processing.records import DECODED, KEY_LENGTH, decode, digest, encode
 from sl_nerfstudio.registration import result
 from sl_nerfstudio.registration.static_projector import NoPlacement, StaticPlacement
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, RelativePose
@@ -26,9 +24,20 @@ from sl_nerfstudio.review.agreement import CrossFrameAgreement, FrameCrossAgreem
 from sl_nerfstudio.scan.types import PoseSigma
 from sl_nerfstudio.storage import locked, read_checked, remove_partial, write_checked
 
-# Results of stages, kept in the work folder: a file for each, with a digest of everything that it follows from.
-
 T = TypeVar("T")
+
+VERSIONS = {
+    "matching": 1,  # along epipolar lines: matching/
+    "calibration": 1,  # the relative pose of a frame: relative_pose/ without the two below
+    "projector": 1,  # estimated intrinsics: relative_pose/unknown_projector.py
+    "test of intrinsics": 1,  # relative_pose/intrinsics.py
+    "static projector": 1,  # registration/static_projector.py
+    "registration": 1,  # registration/
+    "adjustment": 1,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
+}
+"""Number of each stage. Raise it whenever the stage, or anything that it calls, may give another result from the same
+inputs: another algorithm, constant, order of summation or field of a result. Names, comments and speed need none.
+Decoding has the `version` of its decoder instead."""
 
 KEPT: tuple[type, ...] = (
     result.Registration, result.Edge, result.SurfaceDisagrees, result.NoCommonSurface, result.SeparateComponent,
@@ -41,26 +50,36 @@ KEPT: tuple[type, ...] = (
 )  # fmt: skip
 """The dataclasses that results of stages consist of."""
 
-_PACKAGES = ("numpy", "scipy", "torch", "numba")  # the results may differ in the last digit with other versions
 FOLDER = "stages"
-_KEY_LENGTH = 24
+_LIBRARIES = ("numpy", "scipy", "torch", "numba")  # other versions may differ in the last digit
+
+
+def stage_key(stage: str, inputs: object) -> str:
+    """Digest of everything that the result of a stage follows from: its version, its inputs, libraries and machine."""
+    return digest((stage, VERSIONS[stage], _computer(), inputs))
+
+
+@cache
+def _computer() -> str:
+    libraries = " ".join(f"{name} {version(name)}" for name in _LIBRARIES)
+    return f"{platform.machine()} python {platform.python_version()} {libraries}"
 
 
 class StageStore:
-    """Results of stages in a work folder."""
+    """Results of stages in a work folder: one file for each, with its key."""
 
     def __init__(self, work: Path, log: Callable[[str], None] = lambda _: None) -> None:
         """`log` gets a line for every result that is taken from an earlier run."""
         self._folder, self._log = work / FOLDER, log
 
-    def kept(self, stage: str, inputs: object, compute: Callable[[], T]) -> T:
-        """The result of `compute`, or of an earlier run from equal `inputs`, by the same code.
+    def kept(self, stage: str, inputs: object, compute: Callable[[], T], frame: str = "") -> T:
+        """Return the result of `compute`, or that of an earlier run with the same key.
 
         Both are exactly the same: a result is returned as it will be read. `inputs` and the result are dataclasses,
-        tuples, arrays and plain values; the result's dataclasses are among `KEPT`.
+        tuples, arrays and plain values; the result's dataclasses are among `KEPT`. `frame` goes into the file's name.
         """
-        key = digest((surroundings(), inputs))
-        path = self._folder / f"{stage}-{key[:_KEY_LENGTH]}.npz"
+        key = stage_key(stage, inputs)
+        path = self._folder / f"{' '.join(filter(None, (stage, frame)))}-{key[:KEY_LENGTH]}.npz"
         stored = _stored(path)
         if stored is not None and stored[0] == key:
             self._log(f"{stage}: kept from an earlier run")
@@ -82,32 +101,18 @@ def _stored(path: Path) -> tuple[Any, Any] | None:
     return key, value
 
 
-@cache
-def surroundings() -> str:
-    """A digest of the code of this package, of the packages that compute, and of the kind of machine."""
-    root = Path(sl_nerfstudio.__file__).parent
-    found = hashlib.sha256(f"{platform.machine()} {platform.python_version()}".encode())
-    for name in _PACKAGES:
-        found.update(f"{name} {version(name)} ".encode())
-    for path in sorted(root.rglob("*.py")):
-        found.update(str(path.relative_to(root)).encode() + hashlib.sha256(path.read_bytes()).digest())
-    return found.hexdigest()
-
-
 @contextmanager
 def work_folder(root: Path) -> Iterator[None]:
     """Hold the work folder; workers that were killed leave temporary files, which are removed before and after.
 
     Raises UserError if another process works in it, or if it cannot be written to.
     """
+    folders = (root, root / DECODED, root / FOLDER)
     with locked(root):
-        _tidy(root)
+        for folder in folders:
+            remove_partial(folder)
         try:
             yield
         finally:
-            _tidy(root)
-
-
-def _tidy(root: Path) -> None:
-    for folder in (root, root / DECODED, root / FOLDER):
-        remove_partial(folder)
+            for folder in folders:
+                remove_partial(folder)

@@ -1,4 +1,4 @@
-"""The photographs of each frame."""
+"""The photographs of each frame, and the Gray-code sequence that they show."""
 
 import os
 import re
@@ -18,6 +18,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import PatternLayout, SequenceName
+from sl_nerfstudio.processing.config import FEWEST_FRAMES
 from sl_nerfstudio.scan.document import FileError, unreadable
 from sl_nerfstudio.scan.images import ENDINGS, RAW, photograph_header, raw_file, read_photograph, turned_by_tag
 
@@ -68,7 +69,7 @@ class Captures:
         return whole
 
     def with_faults(self, found: dict[str, FileError]) -> "Captures":
-        """With more faults; those of one frame become one."""
+        """Add faults; those of one frame become one."""
         both = {name: [e for e in (self.faults.get(name), found.get(name)) if e] for name in {*self.faults, *found}}
         named = {frame.name: frame for frame in self.frames}
         return replace(self, faults={name: _together(named[name], errors) for name, errors in both.items()})
@@ -86,7 +87,7 @@ def find_captures(root: Path, sequences: bool, cameras: Sequence[str] = ()) -> C
     try:
         found = _of_cameras(root, sequences, cameras) if cameras else [_frames(root, sequences)]
         frames = [frame for turn in zip_longest(*found) for frame in turn if frame is not None]
-        if len(frames) < 2:
+        if len(frames) < FEWEST_FRAMES:
             raise _too_few(root, sequences, len(frames))
     except OSError as error:
         raise unreadable(root, error) from error

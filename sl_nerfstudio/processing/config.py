@@ -11,6 +11,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.layout import SequenceName
 
 Rig = Literal["free", "rigid", "static-projector"]
+FEWEST_FRAMES = 2  # of a scan
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ adjustment the coordinates themselves can be compared, through both devices of e
 that surfaces could not tell from a right one stands out.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -18,8 +18,9 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
     find_registered_minimum,
     keep_registered,
 )
-from sl_nerfstudio.geometry.lie import DevicePoses, angle_deg
+from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.parallel import one_library_thread, results
+from sl_nerfstudio.processing.config import FEWEST_FRAMES
 from sl_nerfstudio.processing.records import LargeClouds
 from sl_nerfstudio.registration.register import include_left_out, with_edges_at_poses, with_relative_pose
 from sl_nerfstudio.registration.result import (
@@ -35,14 +36,14 @@ from sl_nerfstudio.review.agreement import (
     GOOD_EXCESS,
     GOOD_SHARE,
     CrossFrameAgreement,
+    FrameCrossAgreement,
     agreeing_groups,
     compare_frames,
 )
 
-_ROUNDS = 4
+_EXCLUSIONS = 4  # times that contradicting frames are taken out of one group
 _MOVES = 3  # times that frames are tried at other places
 _INCLUSIONS = 3  # times that frames left out are placed
-_FEWEST = 2  # frames of a scan
 _DOUBTFUL_EXCESS = 1.3  # residual of a frame, relative to the better pairs, from which other places are tried
 _DOUBTFUL_SHARE = 0.02  # points that agree fewer than usual, as a share, from which they are tried
 _MOST_DOUBTFUL = 6  # frames that are tried at once, at most a third: the others must say where they belong
@@ -58,20 +59,6 @@ class ConsistentFrames:
     cross: CrossFrameAgreement  # of the registered frames, in their order
 
 
-@dataclass(frozen=True)
-class _Group:
-    """Frames that were adjusted together, and may be adjusted again with others."""
-
-    registration: Registration
-    minimum: RegisteredMinimum
-    cross: CrossFrameAgreement
-
-    def missing(self) -> list[int]:
-        """Frames that are not in it."""
-        found: list[int] = np.flatnonzero(~self.registration.registered).tolist()
-        return found
-
-
 def adjust_consistent(
     clouds: Sequence[FrameCloud],
     registration: Registration,
@@ -80,72 +67,158 @@ def adjust_consistent(
 ) -> ConsistentFrames:
     """Adjust all registered frames, and again without those that contradict the largest group that agrees.
 
-    Frames that agree less well than most are tried at other places, and stay where they agree better.
-
-    Frames that were left out come in if they can be placed against the adjusted ones and agree with them; that is tried
-    again as long as frames come in, because each shows more of the surface to the rest. Each frame is placed once: if
-    it contradicts the others there, too, it stays out. What surfaces do not tell before, they do not tell afterwards
-    either: frames that fit at several places stay out, and of what looks the same from several sides no frame is moved.
-    How far other minima are is asked of the last group only.
+    Frames that agree less well than most are tried at other places, and stay where they agree better. Frames that were
+    left out come in if they can be placed against the adjusted ones and agree with them. What surfaces do not tell
+    before, they do not tell afterwards either: frames that fit at several places stay out, and of what looks the same
+    from several sides no frame is moved. How far other minima are is asked of the last group only.
 
     Raises UserError if fewer than two frames are registered.
     """
-    found = _without_contradictions(clouds, _adjusted(clouds, registration, settings), log, settings)
+    run = _Adjuster(clouds, log, settings)
     undecidable = _undecidable(registration)
-    for _ in range(0 if len(undecidable) == len(clouds) else _MOVES):
-        moved = _moved_elsewhere(clouds, found, log, settings)
-        if moved is None:
-            break
-        found = moved
-    placed_before: set[int] = set()
-    for _ in range(_INCLUSIONS):
-        candidates = [k for k in found.missing() if k not in placed_before | undecidable]
-        more = _placed(clouds, found, candidates)
-        new = [k for k in candidates if more.registered[k]]
-        if not new:
-            break
-        placed_before.update(new)
-        names = ", ".join(registration.names[k] for k in new)
-        log(f"placed against the adjusted frames: {names}; adjusting again with them")
-        larger = _with_agreeing(clouds, more, new, settings)
-        if larger is None:
-            break
-        known, found = found.registration.registered, _without_contradictions(clouds, larger, log, settings)
-        if not (found.registration.registered & ~known).any():
-            break
-    return ConsistentFrames(found.registration, found.minimum.with_other_minima(), found.cross)
+    group = run.without_contradictions(run.adjusted(registration))
+    if len(undecidable) < len(clouds):
+        group = run.with_moved(group)
+    group = run.with_included(group, undecidable)
+    return ConsistentFrames(group.registration, group.minimum.with_other_minima(), group.cross)
 
 
-def _moved_elsewhere(
-    clouds: Sequence[FrameCloud],
-    found: _Group,
-    log: Callable[[str], None],
-    settings: RegisteredFramesSettings | None,
-) -> _Group | None:
-    """With frames that agree less well than the rest at other places; None if they do not agree better there.
+def registered_only(clouds: Sequence[FrameCloud], registration: Registration) -> ConsistentFrames:
+    """All registered frames where registration put them; they are compared within the uncertainty of that.
 
-    Of an object that nearly looks the same from several sides, surfaces that are bent by the errors of their own
-    relative poses may not tell at which a frame is; adjusted ones do.
+    Raises UserError if fewer than two frames are registered.
     """
-    registration, poses = found.registration, found.minimum.frames.poses
-    index = np.flatnonzero(registration.registered).tolist()
-    doubtful = [index[n] for n in _doubtful(found.cross)]
-    if not doubtful:
-        return None
-    without = replace(registration, registered=registration.registered & ~np.isin(np.arange(len(clouds)), doubtful))
-    placed = _placed(clouds, replace(found, registration=without), doubtful)
-    turned = [
-        k for k in doubtful if placed.registered[k]
-        and angle_deg(placed.T_world_camera[k, :3, :3] @ poses.T_world_camera[k, :3, :3].T) > _ELSEWHERE_DEG
-    ]  # fmt: skip
-    if not turned:
-        return None
-    names = ", ".join(registration.names[k] for k in turned)
-    log(f"tried at other places, where they may agree better: {names}")
-    there = _adjusted(clouds, _with_places(registration, poses, placed, turned), settings)
-    before, after = ([group.cross.frames[index.index(k)] for k in turned] for group in (found, there))
-    better = all(b.excess <= a.excess and b.share >= a.share for a, b in zip(before, after, strict=True))
-    return _without_contradictions(clouds, there, log, settings) if better else None
+    kept = keep_registered(clouds, registration)
+    return ConsistentFrames(registration, kept, compare_registered(clouds, registration, kept, exact=False))
+
+
+def _undecidable(registration: Registration) -> set[int]:
+    """Frames that fit at several places: all if the object looks the same from several sides."""
+    if registration.by_order or registration.turns_deg:
+        return set(range(len(registration.names)))
+    torn = {e.frame for e in registration.exclusions if isinstance(e, PairsContradict | UndecidedProjector)}
+    return {k for k, name in enumerate(registration.names) if name in torn}
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Frames that were adjusted together, and may be adjusted again with others."""
+
+    registration: Registration
+    minimum: RegisteredMinimum
+    cross: CrossFrameAgreement
+
+    def agreement(self, frame: int) -> FrameCrossAgreement:
+        """How a registered frame agrees with the others."""
+        return self.cross.frames[int(self.registration.registered[:frame].sum())]
+
+    def agrees_well(self, frame: int) -> bool:
+        """Whether a frame agrees with the others as well as frames of a good scan do."""
+        found = self.agreement(frame)
+        return found.excess <= GOOD_EXCESS and found.share >= GOOD_SHARE
+
+    def named(self, frames: Iterable[int]) -> str:
+        """Names of frames, for a sentence."""
+        return ", ".join(self.registration.names[k] for k in frames)
+
+
+@dataclass(frozen=True)
+class _Adjuster:
+    """Adjusts groups of frames, judges each frame by the coordinates of the others, and acts on the worst."""
+
+    clouds: Sequence[FrameCloud]
+    log: Callable[[str], None]
+    settings: RegisteredFramesSettings | None
+
+    def adjusted(self, registration: Registration) -> _Group:
+        """All registered frames adjusted together."""
+        minimum = find_registered_minimum(self.clouds, registration, self.settings)
+        return _Group(registration, minimum, compare_registered(self.clouds, registration, minimum.frames))
+
+    def without_contradictions(self, group: _Group) -> _Group:
+        """The largest part of a group in which no coordinates contradict each other."""
+        for _ in range(_EXCLUSIONS):
+            index = np.flatnonzero(group.registration.registered).tolist()
+            lost = [[index[n] for n in part] for part in agreeing_groups(group.cross)[1:]]
+            if not lost or len(index) - sum(map(len, lost)) < FEWEST_FRAMES:
+                break
+            names = group.named(k for part in lost for k in part)
+            self.log(f"the coordinates of {names} contradict those of the other frames; adjusting again without them")
+            group = self.adjusted(without_groups(group.registration, lost))
+        return group
+
+    def with_moved(self, group: _Group) -> _Group:
+        """The group with frames that agree less well than the rest at other places, as long as they agree better.
+
+        Of an object that nearly looks the same from several sides, surfaces that are bent by the errors of their own
+        relative poses may not tell at which a frame is; adjusted ones do.
+        """
+        for _ in range(_MOVES):
+            there, turned = self._elsewhere(group)
+            if there is None:
+                break
+            pairs = [(group.agreement(k), there.agreement(k)) for k in turned]
+            if not all(now.excess <= before.excess and now.share >= before.share for before, now in pairs):
+                break
+            group = self.without_contradictions(there)
+        return group
+
+    def _elsewhere(self, group: _Group) -> tuple[_Group | None, list[int]]:
+        """The group adjusted with its doubtful frames where the others place them, and those that this turns."""
+        registration, poses = group.registration, group.minimum.frames.poses
+        index = np.flatnonzero(registration.registered).tolist()
+        doubtful = [index[n] for n in _doubtful(group.cross)]
+        without = replace(
+            registration, registered=registration.registered & ~np.isin(range(len(self.clouds)), doubtful)
+        )
+        placed = self._placed(replace(group, registration=without), doubtful)
+        turned = [
+            k for k in doubtful if placed.registered[k]
+            and angle_deg(placed.T_world_camera[k, :3, :3] @ poses.T_world_camera[k, :3, :3].T) > _ELSEWHERE_DEG
+        ]  # fmt: skip
+        if not turned:
+            return None, []
+        self.log(f"tried at other places, where they may agree better: {group.named(turned)}")
+        T, baseline = poses.T_world_camera.copy(), poses.baseline.copy()
+        T[turned], baseline[turned] = placed.T_world_camera[turned], placed.baseline[turned]
+        moved = replace(registration, T_world_camera=T, baseline=baseline)
+        return self.adjusted(with_edges_at_poses(moved, [registration.names[k] for k in turned])), turned
+
+    def with_included(self, group: _Group, undecidable: set[int]) -> _Group:
+        """The group with frames that were left out and can be placed against it.
+
+        That is tried again as long as frames come in, because each shows more of the surface to the rest. A frame is
+        placed once: if it contradicts the others there, too, it stays out.
+        """
+        placed_before: set[int] = set()
+        for _ in range(_INCLUSIONS):
+            registered = group.registration.registered
+            candidates = [k for k in np.flatnonzero(~registered).tolist() if k not in placed_before | undecidable]
+            more = self._placed(group, candidates)
+            new = [k for k in candidates if more.registered[k]]
+            if not new:
+                break
+            placed_before.update(new)
+            self.log(f"placed against the adjusted frames: {group.named(new)}; adjusting again with them")
+            larger = self.adjusted(more)
+            strangers = [k for k in new if not larger.agrees_well(k)]
+            if len(strangers) == len(new):
+                break
+            if strangers:
+                larger = self.adjusted(without_groups(more, [[k] for k in strangers]))
+            group = self.without_contradictions(larger)
+            if not (group.registration.registered & ~registered).any():
+                break
+        return group
+
+    @one_library_thread()
+    def _placed(self, group: _Group, candidates: Sequence[int]) -> Registration:
+        """The registration with those of the frames that can be placed against the adjusted ones."""
+        if not candidates:
+            return group.registration
+        kept = LargeClouds()
+        sharper = results([partial(_sharper, cloud, group, k, kept) for k, cloud in enumerate(self.clouds)])
+        return include_left_out(sharper, group.registration, group.minimum.frames.poses, candidates)
 
 
 def _doubtful(cross: CrossFrameAgreement) -> list[int]:
@@ -159,87 +232,15 @@ def _doubtful(cross: CrossFrameAgreement) -> list[int]:
     return sorted(worst[: min(_MOST_DOUBTFUL, len(cross.frames) // 3)])
 
 
-def _with_places(
-    registration: Registration, poses: DevicePoses, placed: Registration, turned: Sequence[int]
-) -> Registration:
-    """The registration at adjusted poses, with some frames where they were placed."""
-    T, baseline = poses.T_world_camera.copy(), poses.baseline.copy()
-    T[turned], baseline[turned] = placed.T_world_camera[turned], placed.baseline[turned]
-    moved = replace(registration, T_world_camera=T, baseline=baseline)
-    return with_edges_at_poses(moved, [registration.names[k] for k in turned])
-
-
-def _undecidable(registration: Registration) -> set[int]:
-    """Frames that fit at several places: all if the object looks the same from several sides."""
-    if registration.by_order or registration.turns_deg:
-        return set(range(len(registration.names)))
-    torn = {e.frame for e in registration.exclusions if isinstance(e, PairsContradict | UndecidedProjector)}
-    return {k for k, name in enumerate(registration.names) if name in torn}
-
-
-def _with_agreeing(
-    clouds: Sequence[FrameCloud], more: Registration, new: Sequence[int], settings: RegisteredFramesSettings | None
-) -> _Group | None:
-    """All frames adjusted again with those of the `new` ones that then agree; None if none does."""
-    with_more = _adjusted(clouds, more, settings)
-    doubtful = [k for k in new if not _agrees_well(with_more, k)]
-    if len(doubtful) == len(new):
-        return None
-    return _adjusted(clouds, without_groups(more, [[k] for k in doubtful]), settings) if doubtful else with_more
-
-
-def registered_only(clouds: Sequence[FrameCloud], registration: Registration) -> ConsistentFrames:
-    """All registered frames where registration put them; they are compared within the uncertainty of that.
-
-    Raises UserError if fewer than two frames are registered.
-    """
-    kept = keep_registered(clouds, registration)
-    return ConsistentFrames(registration, kept, _compared(clouds, registration, kept, exact=False))
-
-
-def _agrees_well(found: _Group, k: int) -> bool:
-    """Whether a frame agrees with the others as well as frames of a good scan do."""
-    frame = found.cross.frames[int(found.registration.registered[:k].sum())]
-    return frame.excess <= GOOD_EXCESS and frame.share >= GOOD_SHARE
-
-
-@one_library_thread()
-def _placed(clouds: Sequence[FrameCloud], found: _Group, candidates: Sequence[int]) -> Registration:
-    """The registration with those of the frames that can be placed against the adjusted ones."""
-    if not candidates:
-        return found.registration
-    kept = LargeClouds()
-    sharper = results([partial(_sharper, cloud, found, k, kept) for k, cloud in enumerate(clouds)])
-    return include_left_out(sharper, found.registration, found.minimum.frames.poses, candidates)
-
-
-def _sharper(cloud: FrameCloud, found: _Group, k: int, kept: LargeClouds) -> FrameCloud:
+def _sharper(cloud: FrameCloud, group: _Group, k: int, kept: LargeClouds) -> FrameCloud:
     """The surface of a frame with its adjusted relative pose, which is known far better than by itself."""
-    frames = found.minimum.frames
+    frames = group.minimum.frames
     sigma = frames.sigma[k]
-    if sigma is None or not found.registration.registered[k]:
+    if sigma is None or not group.registration.registered[k]:
         return cloud
     direction = sigma.relative_translation / float(frames.poses.baseline[k])
     turn = float(np.radians(sigma.relative_rotation_deg))
     return kept.kept(with_relative_pose(cloud, frames.poses.T_camera_projector[k], turn, direction))
-
-
-def _without_contradictions(
-    clouds: Sequence[FrameCloud],
-    found: _Group,
-    log: Callable[[str], None],
-    settings: RegisteredFramesSettings | None,
-) -> _Group:
-    for _ in range(_ROUNDS):
-        groups = agreeing_groups(found.cross)
-        index = np.flatnonzero(found.registration.registered)
-        lost = [[int(index[k]) for k in group] for group in groups[1:]]
-        if not lost or len(index) - sum(map(len, lost)) < _FEWEST:
-            break
-        names = ", ".join(found.registration.names[k] for group in lost for k in group)
-        log(f"the coordinates of {names} contradict those of the other frames; adjusting again without them")
-        found = _adjusted(clouds, without_groups(found.registration, lost), settings)
-    return found
 
 
 def without_groups(registration: Registration, groups: Sequence[Sequence[int]]) -> Registration:
@@ -256,24 +257,13 @@ def without_groups(registration: Registration, groups: Sequence[Sequence[int]]) 
     return replace(found, component=component, separate=tuple(separate))
 
 
-def _adjusted(
-    clouds: Sequence[FrameCloud], registration: Registration, settings: RegisteredFramesSettings | None
-) -> _Group:
-    minimum = find_registered_minimum(clouds, registration, settings)
-    return _Group(registration, minimum, compare_registered(clouds, registration, minimum.frames))
-
-
 def compare_registered(
-    clouds: Sequence[FrameCloud], registration: Registration, adjusted: AdjustedFrames
+    clouds: Sequence[FrameCloud], registration: Registration, adjusted: AdjustedFrames, exact: bool = True
 ) -> CrossFrameAgreement:
-    """Coordinates of all registered frames against each other; the poses count as exact, so that errors show."""
-    return _compared(clouds, registration, adjusted, exact=True)
+    """Coordinates of all registered frames against each other.
 
-
-def _compared(
-    clouds: Sequence[FrameCloud], registration: Registration, adjusted: AdjustedFrames, exact: bool
-) -> CrossFrameAgreement:
-    """`exact`: the poses count as exact; else they may err by what they state."""
+    `exact`: the poses count as exact, so that errors show; else they may err by what they state.
+    """
     index = np.flatnonzero(registration.registered)
     chosen = [clouds[k] for k in index]
     sigma = [None if exact else adjusted.sigma[k] for k in index]

@@ -11,7 +11,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from multiprocessing import connection, get_context, resource_tracker
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool
@@ -25,12 +25,12 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.matching.lines import pixels_a_period
 from sl_nerfstudio.matching.matcher import DecodedImage, LineMatcher
-from sl_nerfstudio.parallel import cores, one_library_thread, only_one_library_thread
-from sl_nerfstudio.processing.cache import StageStore, surroundings
+from sl_nerfstudio.parallel import cores, memory_of_process, one_library_thread, only_one_library_thread
+from sl_nerfstudio.processing.cache import StageStore, stage_key
 from sl_nerfstudio.processing.captures import CapturedFrame, Captures
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.masks import UserMasks
-from sl_nerfstudio.processing.records import DecodedStore, LargeClouds, Manifest, digest
+from sl_nerfstudio.processing.records import KEY_LENGTH, DecodedStore, LargeClouds, Manifest
 from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from sl_nerfstudio.relative_pose.estimation import (
@@ -41,45 +41,12 @@ from sl_nerfstudio.relative_pose.estimation import (
 )
 from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.images import as_grey, read_photograph
-from sl_nerfstudio.storage import memory_of_process
-
-# Decoded frames matched along the epipolar lines of their relative poses, kept in the work folder.
-
-_KEY_LENGTH = 24
-
-
-class FrameMatcher:
-    """Matches the frames of one decoder; of those that read more than one image of a frame, none."""
-
-    def __init__(self, decoder: Decoder[Any], store: DecodedStore) -> None:
-        self._decoder = decoder if isinstance(decoder, NetworkDecoder) else None
-        self._matcher = None if self._decoder is None else LineMatcher(self._decoder.layout)
-        self._store = store
-
-    def matched(
-        self, frame: CapturedFrame, key: str, decoded: Decoded, devices: tuple[Device, Device], pose: RelativePose
-    ) -> tuple[str, Decoded] | None:
-        """Key and maps of a frame that was decoded under `key`; None where it is left as it is.
-
-        So are frames that several poses explain: coordinates must not be changed for one of them. Raises FileError if
-        the image cannot be read.
-        """
-        if self._decoder is None or self._matcher is None or pose.alternatives:
-            return None
-        new = digest((surroundings(), key, devices, pose.T_camera_projector))[:_KEY_LENGTH]
-        kept = self._store.load(frame, new)
-        if kept is not None:
-            return new, kept
-        grey = as_grey(read_photograph(frame.images[0]))
-        image = DecodedImage(grey, decoded.coords, decoded.mask)
-        coords = self._matcher.match(image, *devices, pose.T_camera_projector)
-        size = pixels_a_period(decoded.coords, self._decoder.layout.period)
-        if coords is decoded.coords or size is None:
-            return None
-        return new, self._store.save(frame, new, self._decoder.images.decoded(grey, coords, decoded.mask, size))
-
 
 # One frame by itself: decoding, the relative pose of the projector, matching along its lines, triangulation.
+
+Step = Literal["decode", "calibrate", "match"]
+"""How far a frame is processed, each step after those before: without a projector frames are only decoded, and without
+an exact camera they are not matched along epipolar lines."""
 
 
 @dataclass(frozen=True)
@@ -94,8 +61,7 @@ class FrameJob:
     masks: UserMasks | None = None  # of the user
     cameras: dict[str, Device] = field(default_factory=dict)  # by name, if there are several; `camera` is the first
     stated: StatedSigma = field(default_factory=StatedSigma)  # how uncertain the files say the intrinsics are
-    projector_known: bool = True  # False: frames are only decoded, until the projector has been found
-    camera_known: bool = True  # False: nothing is matched along epipolar lines, until the camera has been found
+    last_step: Step = "match"
 
     def camera_of(self, frame: CapturedFrame) -> Device:
         """The camera that took a frame."""
@@ -121,6 +87,18 @@ class FrameStageResult:
         """The frame's name."""
         return self.frame.name
 
+    def failed(self, stage: str, reason: str) -> "FrameStageResult":
+        """The frame left out."""
+        return replace(self, cloud=None, stage=stage, reason=reason)
+
+    def showing(self, selected: Decoded) -> "FrameStageResult":
+        """The frame with the figures of what was decoded."""
+        return replace(self, decode_rate=selected.rate, mask_share=float(selected.mask.mean()))
+
+    def calibrated(self, cloud: FrameCloud) -> "FrameStageResult":
+        """The frame with its cloud, whatever stopped it before."""
+        return replace(self, cloud=cloud, stage="", reason="")
+
 
 def clouds_of(results: Sequence[FrameStageResult]) -> list[FrameCloud]:
     """The clouds of all frames that are not left out."""
@@ -139,30 +117,31 @@ def with_kept_cloud(result: FrameStageResult, clouds: LargeClouds) -> FrameStage
 
 
 class FrameWorker:
-    """Decodes and calibrates frames one after the other."""
+    """Decodes and calibrates frames one after the other, up to the last step of the job."""
 
     def __init__(self, job: FrameJob) -> None:
         self._job = job
         self._store = DecodedStore(job.work, job.decoder.key)
         self._stages = StageStore(job.work)
-        self._matcher = FrameMatcher(job.decoder, self._store)
+        # what is decoded from several images of a frame is exact to begin with
+        self._grid = job.decoder if isinstance(job.decoder, NetworkDecoder) else None
+        self._matcher = None if self._grid is None else LineMatcher(self._grid.layout)
 
     def __call__(self, frame: CapturedFrame) -> FrameStageResult:
-        """Decode (or load) and calibrate a frame. A frame that fails is left out, with its reason."""
+        """Process a frame; what an earlier run did is loaded. A frame that fails is left out, with its reason."""
+        result = FrameStageResult(frame)
         try:
             key = self._store.key(frame)
             decoded = self._store.load(frame, key)
             resumed = decoded is not None
             if decoded is None:
                 decoded = self._store.save(frame, key, self._job.decoder.decode(frame.images))
-            selected = self._selected(frame.name, decoded)
+            result = replace(result.showing(self._selected(frame.name, decoded)), key=key, resumed=resumed)
         except FileError as error:
-            return FrameStageResult(frame, stage="reading", reason=str(error))
+            return result.failed("reading", str(error))
         except DecodingError as error:
-            return FrameStageResult(frame, stage="decoding", reason=self._with_file(frame, error))
-        share = float(selected.mask.mean())
-        result = FrameStageResult(frame, key, resumed, selected.rate, share)
-        return self._calibrated(result, decoded) if self._job.projector_known else result
+            return result.failed("decoding", self._with_file(frame, error))
+        return result if self._job.last_step == "decode" else self._calibrated(result, decoded)
 
     def calibrate(self, result: FrameStageResult) -> FrameStageResult:
         """The frame with its relative pose and cloud from all decoded coordinates, or left out with the reason."""
@@ -173,53 +152,75 @@ class FrameWorker:
         return self.load_with_seen(result)[0]
 
     def load_with_seen(self, result: FrameStageResult) -> tuple[Decoded, Bool[ndarray, "h w"]]:
-        """The same, and where the camera saw the pattern, whatever the user's mask selects."""
+        """Load the maps of a frame, and where the camera saw the pattern, whatever the user's mask selects."""
         stored = self._stored(result, result.matched or result.key)
         return self._selected(result.name, stored), stored.mask
 
     def _calibrated(self, result: FrameStageResult, decoded: Decoded) -> FrameStageResult:
-        job, camera = self._job, self._job.camera_of(result.frame)
-        selected = self._selected(result.name, decoded)
-        seen = decoded.mask  # also where the user's mask selects nothing
+        result, devices = replace(result, matched=""), (self._job.camera_of(result.frame), self._job.projector)
         try:
+            selected = self._selected(result.name, decoded)
             pose = self._pose(result, selected)
-            devices = camera, job.projector
-            found = (
-                self._matcher.matched(result.frame, result.key, decoded, devices, pose) if job.camera_known else None
-            )
-            result = replace(result, matched="")
-            if found is not None:
-                selected, seen = self._selected(result.name, found[1]), found[1].mask
-                share = float(selected.mask.mean())
-                result = replace(result, matched=found[0], decode_rate=selected.rate, mask_share=share)
-                pose = self._pose_near(pose, result, selected)
+            matched = self._match(result, decoded, pose) if self._job.last_step == "match" else None
+            if matched is not None:
+                key, decoded = matched
+                selected = self._selected(result.name, decoded)
+                result = replace(result.showing(selected), matched=key)
+                pose = self._pose(result, selected, near=pose)
+            seen = decoded.mask  # also where the user's mask selects nothing
             cloud = frame_cloud(result.name, selected.coords, *devices, pose, light=selected.light, seen=seen)
         except FileError as error:
-            return replace(result, cloud=None, stage="reading", reason=str(error))
+            return result.failed("reading", str(error))
         except DecodingError as error:  # nothing that was matched is inside the user's mask
-            return replace(result, cloud=None, stage="decoding", reason=self._with_file(result.frame, error))
+            return result.failed("decoding", self._with_file(result.frame, error))
         except RelativePoseError as error:
-            return replace(result, cloud=None, stage="calibrating", reason=self._with_file(result.frame, error))
+            return result.failed("calibrating", self._with_file(result.frame, error))
         return replace(result, cloud=cloud)
 
-    def _pose(self, result: FrameStageResult, decoded: Decoded) -> RelativePose:
-        """From all coordinates, or as an earlier run found it."""
-        job, coords, camera = self._job, decoded.coords, self._job.camera_of(result.frame)
+    def _pose(self, result: FrameStageResult, decoded: Decoded, near: RelativePose | None = None) -> RelativePose:
+        """The relative pose from all coordinates, as an earlier run found it if it did.
+
+        With `near`, the pose that the coordinates were matched with, no other one is looked for.
+        """
+        coords, job = decoded.coords, self._job
+        devices = job.camera_of(result.frame), job.projector
+        if near is None:
+            inputs = (coords, *devices, job.seed)
+            return self._stages.kept(
+                "calibration",
+                inputs,
+                lambda: estimate_relative_pose(*correspondences_of(coords), *devices, job.seed),
+                result.name,
+            )
+        T = near.T_camera_projector
         return self._stages.kept(
-            f"calibration {result.name}",
-            (coords, camera, job.projector, job.seed),
-            lambda: estimate_relative_pose(*correspondences_of(coords), camera, job.projector, job.seed),
+            "calibration",
+            (coords, *devices, job.seed, T),
+            lambda: relative_pose_near(T, *correspondences_of(coords), *devices, job.seed),
+            result.name,
         )
 
-    def _pose_near(self, start: RelativePose, result: FrameStageResult, decoded: Decoded) -> RelativePose:
-        """From the coordinates that were matched with the pose `start`, beside which there is no other."""
-        job, coords, camera = self._job, decoded.coords, self._job.camera_of(result.frame)
-        T = start.T_camera_projector
-        return self._stages.kept(
-            f"calibration {result.name}",
-            (coords, camera, job.projector, job.seed, T),
-            lambda: relative_pose_near(T, *correspondences_of(coords), camera, job.projector, job.seed),
+    def _match(self, result: FrameStageResult, decoded: Decoded, pose: RelativePose) -> tuple[str, Decoded] | None:
+        """Key and maps of a frame matched along the epipolar lines of `pose`; None where it is left as it is.
+
+        So are frames that several poses explain: coordinates must not be changed for one of them. Raises FileError if
+        the image cannot be read.
+        """
+        if self._grid is None or self._matcher is None or pose.alternatives:
+            return None
+        frame, devices = result.frame, (self._job.camera_of(result.frame), self._job.projector)
+        key = stage_key("matching", (result.key, *devices, pose.T_camera_projector))[:KEY_LENGTH]
+        kept = self._store.load(frame, key)
+        if kept is not None:
+            return key, kept
+        grey = as_grey(read_photograph(frame.images[0]))
+        coords = self._matcher.match(
+            DecodedImage(grey, decoded.coords, decoded.mask), *devices, pose.T_camera_projector
         )
+        size = pixels_a_period(decoded.coords, self._grid.layout.period)
+        if coords is decoded.coords or size is None:
+            return None
+        return key, self._store.save(frame, key, self._grid.images.decoded(grey, coords, decoded.mask, size))
 
     def _stored(self, result: FrameStageResult, key: str) -> Decoded:
         decoded = self._store.load(result.frame, key)
@@ -299,7 +300,7 @@ def _end_with_parent() -> None:
 def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) -> list[FrameStageResult]:
     """Results of all frames, in the order of the captures; the manifest in the work folder is kept up to date."""
     found: dict[str, FrameStageResult] = {
-        frame.name: FrameStageResult(frame, stage="reading", reason=str(captures.faults[frame.name]))
+        frame.name: FrameStageResult(frame).failed("reading", str(captures.faults[frame.name]))
         for frame in captures.frames
         if frame.name in captures.faults
     }
@@ -322,7 +323,7 @@ def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) ->
 def run_frame_stage_again(
     config: ProcessConfig, job: FrameJob, captures: Captures, before: Sequence[FrameStageResult]
 ) -> list[FrameStageResult]:
-    """The same with another job, for frames that this run has decoded."""
+    """Run the frame stage with another job, on frames that this run has decoded."""
     resumed = {result.name: result.resumed for result in before}
     return [replace(r, resumed=resumed[r.name]) for r in run_frame_stage(config, job, captures)]
 

@@ -35,7 +35,7 @@ from sl_nerfstudio.processing.captures import (
     recognise_sequence,
     resolution,
 )
-from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
 from sl_nerfstudio.processing.frames import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_kept_cloud
 from sl_nerfstudio.processing.masks import find_masks
 from sl_nerfstudio.processing.records import LargeClouds
@@ -108,7 +108,7 @@ class CameraNotes:
     found: CameraEstimate
 
     def sentence(self) -> str:
-        """For the output and the report."""
+        """Describe the camera for the output and the report."""
         camera, (x, y) = self.found.camera, self.found.sigma_centre_px
         return (
             f"camera: focal length {self.start.camera.fl_x:.0f} px ± {100 * self.start.sigma:.0f} % from EXIF "
@@ -118,7 +118,7 @@ class CameraNotes:
         )
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the figures as JSON."""
         start, camera = self.start, self.found.camera
         return {
             "source": start.source,
@@ -159,7 +159,7 @@ def refine_camera(
         raise ValueError("no frame has a pose")
     notes = CameraNotes(start, found)
     log(notes.sentence())
-    return replace(refined, camera_known=True), again, notes
+    return replace(refined, last_step="match"), again, notes
 
 
 # What the user's files say of the projector.
@@ -234,11 +234,11 @@ class CaptureNotes:
     camera: dict[str, Any] | None = None  # figures of a camera that no file describes
 
     def with_camera(self, sentence: str, figures: dict[str, Any]) -> "CaptureNotes":
-        """With what is known of a camera that no file describes."""
+        """Add what is known of a camera that no file describes."""
         return replace(self, sentences=(*self.sentences, sentence), camera=figures)
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the figures as JSON."""
         video = None if self.video is None else self.video.document()
         names = {"sequence": self.sequence, "sequence_recognised": self.recognised}
         return {**names, "video": video, "camera_focal": self.camera}
@@ -364,7 +364,7 @@ def read_given_poses(path: Path, names: Sequence[str]) -> GivenPoses:
     if not isinstance(units, str) or units not in UNITS:
         raise FileError(path, f"units is {units!r}", "an unknown unit", f"give one of {', '.join(UNITS)}")
     given = GivenPoses(T, units)
-    if given.known.sum() < 2:
+    if given.known.sum() < FEWEST_FRAMES:
         raise FileError(
             path,
             "has poses for fewer than two of the captures",
@@ -405,6 +405,9 @@ def _points(T: Float64[ndarray, "n 4 4"], distance: float) -> Float64[ndarray, "
     return np.concatenate([centre, *(centre + distance * axis for axis in (right, up, -back))])
 
 
+# Everything together.
+
+
 @dataclass(frozen=True)
 class Inputs:
     """Everything that the stages start from."""
@@ -430,22 +433,13 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     cameras = read_cameras(config, captures)
     require_known_camera(config, cameras)
     projector, stated = read_projector(config, (layout.w, layout.h))
-    masks = None if config.masks is None else find_masks(config.masks, _sizes_of_frames(captures))
+    sizes = {frame.name: captures.sizes[frame.camera] for frame in captures.frames}
+    masks = None if config.masks is None else find_masks(config.masks, sizes)
     doubt = StatedSigma(cameras.sigma, read_projector_sigma(config, (layout.w, layout.h)) if stated else CERTAIN)
-    known_beam = not config.finds_projector
+    last_step = "decode" if config.finds_projector else "match" if cameras.start is None else "calibrate"
+    devices = cameras.first, projector
     return Inputs(
-        FrameJob(
-            config.work_folder,
-            decoder,
-            cameras.first,
-            projector,
-            config.seed,
-            masks,
-            cameras.several,
-            doubt,
-            known_beam,
-            cameras.start is None,
-        ),
+        FrameJob(config.work_folder, decoder, *devices, config.seed, masks, cameras.several, doubt, last_step),
         cameras,
         captures,
         stated,
@@ -453,10 +447,6 @@ def read_inputs(config: ProcessConfig) -> Inputs:
         None if known is None else frames_by_name(known, names),
         captured.notes,
     )
-
-
-def _sizes_of_frames(captures: Captures) -> dict[str, tuple[int, int]]:
-    return {frame.name: captures.sizes[frame.camera] for frame in captures.frames}
 
 
 def frames_by_name(known: KnownLength, names: Sequence[str]) -> KnownLength:

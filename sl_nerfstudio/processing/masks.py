@@ -74,9 +74,7 @@ def _used(path: Path, values: UInt8[ndarray, "h w"] | UInt16[ndarray, "h w"]) ->
     return share >= 0.5
 
 
-def _read(
-    path: Path,
-) -> tuple[UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"], Bool[ndarray, "h w"]]:
+def _read(path: Path) -> tuple[UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"], Bool[ndarray, "h w"]]:
     """Pixels in grey or RGB, and which of them are not transparent."""
     try:
         with Image.open(BytesIO(read_bytes(path)), formats=FORMATS) as image:
@@ -128,7 +126,7 @@ class UserMasks:
 
     @property
     def digest(self) -> str:
-        """Of all masks together."""
+        """Digest of all masks together."""
         lines = "\n".join(f"{name} {digest}" for name, digest in sorted(self.digests.items()))
         return hashlib.sha256(lines.encode()).hexdigest()[:24]
 

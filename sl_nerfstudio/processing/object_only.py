@@ -1,4 +1,4 @@
-"""`--object-only`: which part every pixel of the registered frames shows, after all poses are known."""
+"""`--object-only`: which part every pixel of the registered frames shows; with small pictures for the report."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -42,7 +42,7 @@ class ObjectOnly:
         return self.parts[frame] == Part.OBJECT
 
     def shares(self) -> FrameShares:
-        """Of all frames together; each counts alike."""
+        """Mean shares of all frames; each counts alike."""
         means = np.mean([(f.object, f.plane, f.beyond) for f in self.frames], axis=0).tolist()
         return FrameShares("all", *means)
 
@@ -134,7 +134,7 @@ def plane_sentence(plane: PlaneFinding, left_out: bool) -> str:
 
 
 def object_document(found: ObjectOnly) -> dict[str, Any]:
-    """For processing.json; planes are `normal . p = offset` in the axes and the unit of the scan."""
+    """Figures for processing.json; planes are `normal . p = offset` in the axes and the unit of the scan."""
     shares = found.shares()
     return {
         "object": shares.object,

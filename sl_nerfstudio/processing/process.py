@@ -20,8 +20,8 @@ from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import ShownImage
 from sl_nerfstudio.processing.cache import StageStore, work_folder
-from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.consistency import adjust_consistent, registered_only
+from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
+from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent, registered_only
 from sl_nerfstudio.processing.frames import (
     FrameJob,
     FrameStageResult,
@@ -39,6 +39,7 @@ from sl_nerfstudio.processing.object_only import (
     with_usable_scale,
 )
 from sl_nerfstudio.processing.projector import (
+    CalibratedFrames,
     adjustment_settings,
     calibrate_frames,
     contradiction_by_epipolar_geometry,
@@ -60,7 +61,6 @@ from sl_nerfstudio.storage import NewFolder, write_atomic
 
 # The errors of a run whose frames cannot make a scan: they say what happened to every frame.
 
-FEWEST_FRAMES = 2
 REPORT = "processing.html"
 _LISTED = 20  # frames in a message
 
@@ -98,7 +98,7 @@ def require_given_poses(
         lines = []
         for name in with_pose:
             failure = reasons[name]
-            what = "registered" if failure is None else f"left out in {failure.stage}: {first_line(failure.reason)}"
+            what = "registered" if failure is None else f"left out in {failure[0]}: {first_line(failure[1])}"
             lines.append(f"{name}: {what}")
         raise UserError(
             f"{path}: {len(usable)} of the {len(with_pose)} frames with given poses could be registered, the axes and "
@@ -200,80 +200,108 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
 
 def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, log: Log) -> ProcessResult:
     inputs = read_inputs(config)
-    job, captures = inputs.job, inputs.captures
-    log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {job.decoder.name}")
+    captures, decoder = inputs.captures, inputs.job.decoder.name
+    log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
     for sentence in inputs.notes.sentences:
         log(sentence)
-
-    calibrated = calibrate_frames(config, inputs, log)
-    job, results, found = calibrated.job, calibrated.results, calibrated.found
-    _require_clouds(config, inputs, results, make_report)
-    notes = inputs.notes
-    if inputs.cameras.start is not None:
-        job, results, camera = refine_camera(job, results, inputs.cameras.start, log)
-        notes = notes.with_camera(camera.sentence(), camera.document())
-        results = run_frame_stage_again(config, job, captures, results)
-        _require_clouds(config, inputs, results, make_report)
-    wrong = (
-        ""
-        if found is not None or inputs.cameras.start is not None
-        else contradiction_by_epipolar_geometry(job, results)
+    frames = _calibrate(config, inputs, make_report, log)
+    wrong = _wrong_intrinsics(inputs, frames, log)
+    given = inputs.given and inputs.given.chosen([result.cloud is not None for result in frames.results])
+    frames, registration = _register(config, inputs, frames, given, log)
+    _require_registered(config, inputs, frames.results, registration, wrong, make_report)
+    frames, consistent = _adjust(config, inputs, frames, registration, log)
+    registration, adjusted = consistent.registration, within_stated_doubt(consistent.adjusted, frames.job.stated)
+    poses = find_scan_poses(clouds_of(frames.results), registration, adjusted, inputs.known, given)
+    shares = _surface_shares(frames.job, frames.results, registration, adjusted.poses)
+    result = summarise(
+        config,
+        decoder,
+        frames.results,
+        registration,
+        poses,
+        consistent.cross,
+        shares,
+        frames.found,
+        wrong,
+        frames.notes,
     )
-    if wrong:
-        log(wrong)
-
-    clouds = clouds_of(results)
-    if inputs.known is not None:
-        require_known_frames(inputs.known, clouds)
-    given = _given_for_clouds(inputs.given, results)
-    start = None if given is None else given.T_world_camera
-    store = StageStore(job.work, log)
-    if calibrated.registration is None:
-        chosen, registration = store.kept(
-            "registration",
-            (clouds, config.unordered, config.seed, start),
-            lambda: _register(clouds, config.unordered, config.seed, start, log),
-        )
-        clouds = chosen_clouds(clouds, chosen)
-        results = with_clouds(results, clouds)
-        if config.rig == "rigid":
-            registration = with_equal_baselines(registration)
-    else:
-        registration = calibrated.registration
-    log(f"registered {int(registration.registered.sum())} of {len(clouds)} frames")
-    _require_registered(config, inputs, results, registration, wrong, make_report)
-
-    settings = adjustment_settings(config.rig, found)
-    if config.no_adjust:
-        consistent = registered_only(clouds, registration)
-    else:
-        consistent = store.kept(
-            "adjustment",
-            (clouds, registration, settings),
-            lambda: adjust_consistent(clouds, registration, log, settings),
-        )
-    if found is not None and config.rig != "static-projector":  # whose placement has adjusted everything
-        refined = refine_projector(clouds, consistent, found, job.stated.camera, settings, log)
-        clouds, consistent, found = refined.clouds, refined.consistent, refined.found
-        log(f"after the joint adjustment: {describe(found)}")
-        job, results = replace(job, projector=found.projector), with_clouds(results, clouds)
-    registration = consistent.registration
-    adjusted = within_stated_doubt(consistent.adjusted, job.stated)
-    poses = find_scan_poses(clouds, registration, adjusted, inputs.known, given)
-    shares = _surface_shares(job, results, registration, adjusted.poses)
-    result = summarise(config, job.decoder.name, results, registration, poses, consistent.cross, shares, found, wrong)
-    result = replace(result, captured=notes)
     if config.object_only:
-        parts = find_object_only(job, results, registration, poses)
+        parts = find_object_only(frames.job, frames.results, registration, poses)
         log("object only: " + "\n    ".join(object_sentences(parts)))
         poses, result = with_usable_scale(poses, parts), with_object_only(result, parts)
     if result.joint_px is not None:
         log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
-    write_scan(folder, job, results, poses, result, make_report)
+    write_scan(folder, frames.job, frames.results, poses, result, make_report)
     return result
 
 
+def _calibrate(config: ProcessConfig, inputs: Inputs, make_report: MakeReport, log: Log) -> CalibratedFrames:
+    """Decode and calibrate all frames; a camera that no file describes is refined with all of them."""
+    frames = calibrate_frames(config, inputs, log)
+    _require_clouds(config, inputs, frames.results, make_report)
+    start = inputs.cameras.start
+    if start is None:
+        return frames
+    job, results, camera = refine_camera(frames.job, frames.results, start, log)
+    results = run_frame_stage_again(config, job, inputs.captures, results)
+    _require_clouds(config, inputs, results, make_report)
+    notes = inputs.notes.with_camera(camera.sentence(), camera.document())
+    return replace(frames, job=job, results=results, notes=notes)
+
+
+def _wrong_intrinsics(inputs: Inputs, frames: CalibratedFrames, log: Log) -> str:
+    """Which of the stated intrinsics the frames contradict; "" if none, or if they were found from the frames."""
+    if frames.found is not None or inputs.cameras.start is not None:
+        return ""
+    wrong = contradiction_by_epipolar_geometry(frames.job, frames.results)
+    if wrong:
+        log(wrong)
+    return wrong
+
+
 def _register(
+    config: ProcessConfig, inputs: Inputs, frames: CalibratedFrames, given: GivenPoses | None, log: Log
+) -> tuple[CalibratedFrames, Registration]:
+    """The frames with the pose of each projector that the others decide for, and the registration of these."""
+    clouds, registration = clouds_of(frames.results), frames.registration
+    if inputs.known is not None:
+        require_known_frames(inputs.known, clouds)
+    if registration is None:
+        settings = config.unordered, config.seed, None if given is None else given.T_world_camera
+        chosen, registration = StageStore(frames.job.work, log).kept(
+            "registration", (clouds, *settings), lambda: register_clouds(clouds, *settings, log)
+        )
+        frames = replace(frames, results=with_clouds(frames.results, chosen_clouds(clouds, chosen)))
+        if config.rig == "rigid":
+            registration = with_equal_baselines(registration)
+    log(f"registered {int(registration.registered.sum())} of {len(clouds)} frames")
+    return frames, registration
+
+
+def _adjust(
+    config: ProcessConfig, inputs: Inputs, frames: CalibratedFrames, registration: Registration, log: Log
+) -> tuple[CalibratedFrames, ConsistentFrames]:
+    """All registered frames adjusted together, and with them a projector that was found from the frames."""
+    clouds, found = clouds_of(frames.results), frames.found
+    settings = adjustment_settings(config.rig, found)
+    if config.no_adjust:
+        consistent = registered_only(clouds, registration)
+    else:
+        consistent = StageStore(frames.job.work, log).kept(
+            "adjustment",
+            (clouds, registration, settings),
+            lambda: adjust_consistent(clouds, registration, log, settings),
+        )
+    if found is None or config.rig == "static-projector":  # whose placement has adjusted everything
+        return frames, consistent
+    refined = refine_projector(clouds, consistent, found, inputs.job.stated.camera, settings, log)
+    log(f"after the joint adjustment: {describe(refined.found)}")
+    job = replace(frames.job, projector=refined.found.projector)
+    results = with_clouds(frames.results, refined.clouds)
+    return replace(frames, job=job, results=results, found=refined.found), refined.consistent
+
+
+def register_clouds(
     clouds: Sequence[FrameCloud], unordered: bool, seed: int, start: Float64[ndarray, "n 4 4"] | None, log: Log
 ) -> tuple[tuple[int, ...], Registration]:
     """Which cloud of every frame, and the registration of these; every pair is tried if the order says nothing."""
@@ -327,8 +355,3 @@ def _require_registered(
         raise too_few_frames(result, usable, make_report)
     if inputs.given is not None:
         require_given_poses(config, inputs.given, results, registration)
-
-
-def _given_for_clouds(given: GivenPoses | None, results: Sequence[FrameStageResult]) -> GivenPoses | None:
-    """The given poses of the frames that have a cloud."""
-    return None if given is None else given.chosen([result.cloud is not None for result in results])

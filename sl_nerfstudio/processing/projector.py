@@ -1,7 +1,7 @@
-"""The frame stage with what is known of the projector and of the rig: every frame decoded and calibrated."""
+"""Projector and rig: intrinsics found from the frames, tested and refined; all frames calibrated with them."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,7 @@ from sl_nerfstudio.decoding.decoder import Decoded
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, DeviceChange
 from sl_nerfstudio.processing.cache import StageStore
-from sl_nerfstudio.processing.config import ProcessConfig, Rig
+from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig, Rig
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent
 from sl_nerfstudio.processing.frames import (
     FrameJob,
@@ -35,7 +35,7 @@ from sl_nerfstudio.processing.frames import (
     run_frame_stage_again,
     with_kept_cloud,
 )
-from sl_nerfstudio.processing.inputs import Inputs
+from sl_nerfstudio.processing.inputs import CaptureNotes, Inputs
 from sl_nerfstudio.processing.records import LargeClouds
 from sl_nerfstudio.registration.result import NoCommonSurface, Registration
 from sl_nerfstudio.registration.static_projector import (
@@ -56,7 +56,7 @@ from sl_nerfstudio.relative_pose.intrinsics import Explanation, IntrinsicsEviden
 from sl_nerfstudio.relative_pose.joint_fit import CX, CY, K1, LOG_ASPECT, LOG_FOCAL, FrameMatches
 from sl_nerfstudio.relative_pose.unknown_projector import Cause, NoProjector, ProjectorEstimate, estimate_projector
 
-# Sentences on a projector that was, or could not be, found.
+# Sentences on intrinsics that were found, could not be found, or are contradicted.
 
 _MORE_CAMERAS = (
     "add views from places that differ more, of something with depth; or give the projector's intrinsics (sl-calibrate)"
@@ -220,7 +220,7 @@ class FoundProjector:
         return dict(zip(FIELDS, self.sigma, strict=True))
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the figures as JSON."""
         device = self.projector
         return {
             "method": self.method,
@@ -244,25 +244,17 @@ def describe(found: FoundProjector) -> str:
 # `--estimate-projector` for devices that move freely: intrinsics from all decoded frames.
 
 
-def decoded_matches(
-    job: FrameJob, results: Sequence[FrameStageResult]
-) -> tuple[list[FrameStageResult], list[FrameMatches]]:
-    """Frames that were decoded, and their correspondences."""
-    worker = FrameWorker(job)
-    decoded = [result for result in results if result.key]
-    coords = [worker.load(result).coords for result in decoded]
-    return decoded, [
-        FrameMatches(result.name, *correspondences_of(uv), job.camera_of(result.frame))
-        for result, uv in zip(decoded, coords, strict=True)
-    ]
-
-
 def find_projector(job: FrameJob, results: Sequence[FrameStageResult], stated: bool) -> FoundProjector:
     """The projector from the epipolar geometry of all decoded frames.
 
     Raises UserError, with the cause that was measured and what to add, where the frames do not determine it.
     """
-    _, matches = decoded_matches(job, results)
+    worker = FrameWorker(job)
+    matches = [
+        FrameMatches(result.name, *correspondences_of(worker.load(result).coords), job.camera_of(result.frame))
+        for result in results
+        if result.key
+    ]
     if not matches:
         raise UserError("no frame was decoded, so the projector's intrinsics cannot be estimated")
     found = StageStore(job.work).kept(
@@ -347,10 +339,7 @@ def refine_projector(
         new = DeviceChange(*step.tolist()).applied(projector)
         new_clouds = with_projector(clouds, consistent, new)
         again = adjust_consistent(
-            new_clouds,
-            at_adjusted_poses(consistent),
-            log,
-            replace(settings, projector=knowledge(found, new)),
+            new_clouds, at_adjusted_poses(consistent), log, replace(settings, projector=knowledge(found, new))
         )
         left = again.adjusted.intrinsics
         if left is None or not left.known or _chi_square(left) >= chi_square:
@@ -360,13 +349,13 @@ def refine_projector(
 
 
 def _chi_square(calibration: SelfCalibration) -> float:
-    """Of the change of the projector alone that would agree best: about three if nothing is wrong."""
+    """Chi square of the best change of the projector alone: about three if nothing is wrong."""
     step, uncertainty = calibration.of_projector()
     return float(step @ torch.linalg.solve(uncertainty, step))
 
 
 def _covariance(calibration: SelfCalibration, camera_sigma: Shares) -> Float[Tensor, "3 3"]:
-    """Of the projector: by errors of neighbouring pixels that depend on each other, and by an uncertain camera."""
+    """Covariance of the projector, by correlated errors of neighbouring pixels and by an uncertain camera."""
     return DEPENDENCE**2 * calibration.of_projector()[1] + calibration.projector_by_camera(camera_sigma)
 
 
@@ -439,12 +428,10 @@ def _with_pose(
     own = relative_pose_near(T, *correspondences_of(coords), job.camera, job.projector, job.seed)
     pose = replace(own, T_camera_projector=T, covariance=common.covariance, degeneracies=common.degeneracies)
     try:
-        cloud: FrameCloud | None = frame_cloud(
-            result.name, coords, job.camera, job.projector, pose, light=decoded.light, seen=seen
-        )
+        cloud = frame_cloud(result.name, coords, job.camera, job.projector, pose, light=decoded.light, seen=seen)
     except RelativePoseError as error:
-        return replace(result, cloud=None, stage="calibrating", reason=f"{result.frame.images[0]}: {error}")
-    return replace(result, cloud=cloud, stage="", reason="")
+        return result.failed("calibrating", f"{result.frame.images[0]}: {error}")
+    return result.calibrated(cloud)
 
 
 def with_equal_baselines(registration: Registration) -> Registration:
@@ -455,7 +442,6 @@ def with_equal_baselines(registration: Registration) -> Registration:
 
 # Whether the stated intrinsics can be right, by the epipolar geometry of all frames: before anything is registered.
 
-_FEWEST = 2  # frames: four constraints on three values
 _DECISIVE = 0.5  # share of the errors that other intrinsics leave: then it is they that made frames look doubtful
 
 
@@ -463,8 +449,8 @@ def contradiction_by_epipolar_geometry(job: FrameJob, results: Sequence[FrameSta
     """Which intrinsics the frames contradict, with the values that would agree; "" if none."""
     every = clouds_of(results)
     firm = _firm(every)
-    clouds = firm if len(firm) >= _FEWEST else every
-    if len(clouds) < _FEWEST or len({cloud.camera for cloud in clouds}) > 1:
+    clouds = firm if len(firm) >= FEWEST_FRAMES else every  # of two, four constraints on three values
+    if len(clouds) < FEWEST_FRAMES or len({cloud.camera for cloud in clouds}) > 1:
         return ""
     frames = [FrameMatches(c.name, *correspondences_of(c.coords), c.camera) for c in clouds]
     poses = [(c.pose.T_camera_projector[:3, :3], c.pose.T_camera_projector[:3, 3]) for c in clouds]
@@ -475,7 +461,7 @@ def contradiction_by_epipolar_geometry(job: FrameJob, results: Sequence[FrameSta
     )
     evidence = evidence.allowing(job.stated.either)
     stated_px, best_px = evidence.projector.noise_px
-    decisive = len(firm) >= _FEWEST or best_px < _DECISIVE * stated_px
+    decisive = len(firm) >= FEWEST_FRAMES or best_px < _DECISIVE * stated_px
     return wrong_intrinsics(evidence) if decisive and evidence.contradicts() else ""
 
 
@@ -496,82 +482,69 @@ def _firm(clouds: Sequence[FrameCloud]) -> list[FrameCloud]:
 
 # `--rig static-projector`: cameras placed by the codes, the projector by resection, every frame calibrated with it.
 
-_METHOD = "by resection from the cameras"
 
-
-@dataclass(frozen=True)
-class PlacedFrames:
-    """All frames under a projector that stands still."""
-
-    results: Sequence[FrameStageResult]
-    projector: Device
-    found: FoundProjector | None  # None: its intrinsics are as stated
-    registration: Registration  # of the frames that have clouds
-
-
-def place_static(job: FrameJob, results: Sequence[FrameStageResult], stated: bool, estimate: bool) -> PlacedFrames:
+def place_static(
+    job: FrameJob, results: Sequence[FrameStageResult], stated: bool, estimate: bool
+) -> "CalibratedFrames":
     """Placement of all decoded frames; the projector's intrinsics are found if none are stated, or on request.
 
     Raises UserError, with what was measured and what to add, where the frames do not determine the poses.
     """
-    worker = FrameWorker(job)
     decoded = [result for result in results if result.key]
-    if len(decoded) < _FEWEST:
-        return PlacedFrames(results, job.projector, None, _registration((), np.zeros((0, 4, 4)), np.zeros(0)))
+    if len(decoded) < FEWEST_FRAMES:
+        job = replace(job, last_step="match")
+        return CalibratedFrames(job, results, None, _registration((), np.zeros((0, 4, 4)), np.zeros(0)))
+    worker, known = FrameWorker(job), stated and not estimate
     coords = [worker.load(result).coords for result in decoded]
-    known = stated and not estimate
-    cameras = [job.camera_of(result.frame) for result in decoded]
-    placed = StageStore(job.work).kept(
-        "static projector",
-        (coords, cameras, job.projector, known, stated),
-        lambda: place_under_static_projector(coords, cameras, job.projector, known, stated),
-    )
+    inputs = (coords, [job.camera_of(result.frame) for result in decoded], job.projector, known, stated)
+    placed = StageStore(job.work).kept("static projector", inputs, lambda: place_under_static_projector(*inputs))
     if isinstance(placed, NoPlacement):
         raise static_not_found(placed, len(decoded))
-    found = None if known else _found(placed, len(decoded))
+    job = replace(job, projector=placed.projector, last_step="match")
     T = {result.name: pose for result, pose in zip(decoded, placed.T_world_camera, strict=True)}
     maps = {result.name: uv for result, uv in zip(decoded, coords, strict=True)}
     clouds = LargeClouds()
-    results = [with_kept_cloud(_calibrated(result, maps, T, placed, job), clouds) for result in results]
-    with_cloud = [result for result in results if result.cloud is not None]
-    poses = np.stack([T[result.name] for result in with_cloud]) if with_cloud else np.zeros((0, 4, 4))
+    results = [
+        with_kept_cloud(_calibrated(r, maps[r.name], T[r.name], placed, job), clouds) if r.name in T else r
+        for r in results
+    ]
+    names = [cloud.name for cloud in clouds_of(results)]
+    poses = np.stack([T[name] for name in names]) if names else np.zeros((0, 4, 4))
     baseline = np.linalg.norm(poses[:, :3, 3] - placed.T_world_projector[:3, 3], axis=1)
-    return PlacedFrames(results, placed.projector, found, _registration([r.name for r in with_cloud], poses, baseline))
+    found = None if known else _found(placed, len(decoded))
+    return CalibratedFrames(job, results, found, _registration(names, poses, baseline))
 
 
 def _found(placed: StaticPlacement, frames: int) -> FoundProjector:
     sigma = sigma_of_fields(placed.projector, placed.covariance)
     doubt = static_doubt(sigma[0] / placed.projector.fl_x, frames)
-    return FoundProjector(placed.projector, sigma, frames, placed.noise_px, _METHOD, doubt)
+    return FoundProjector(placed.projector, sigma, frames, placed.noise_px, "by resection from the cameras", doubt)
 
 
 def _calibrated(
     result: FrameStageResult,
-    coords: dict[str, Float32[ndarray, "_ _ 2"]],
-    T_world_camera: dict[str, Float64[ndarray, "4 4"]],
+    coords: Float32[ndarray, "_ _ 2"],
+    T_world_camera: Float64[ndarray, "4 4"],
     placed: StaticPlacement,
     job: FrameJob,
 ) -> FrameStageResult:
     """The frame with the relative pose that the placement gives, refined by its own coordinates; or left out."""
-    if result.name not in coords:
-        return result
-    T, uv = T_world_camera[result.name], coords[result.name]
-    if not np.isfinite(T).all():
-        reason = (
+    if not np.isfinite(T_world_camera).all():
+        return result.failed(
+            "calibrating",
             f"{result.frame.images[0].parent}: it shares too little with the other frames to place its camera\n"
             "    cause:  few codes of the projector are seen by it and by another camera\n"
-            "    remedy: capture views in between"
+            "    remedy: capture views in between",
         )
-        return replace(result, stage="calibrating", reason=reason)
-    relative = np.linalg.inv(T) @ placed.T_world_projector
-    own = relative_pose_near(relative, *correspondences_of(uv), job.camera_of(result.frame), placed.projector, job.seed)
+    camera = job.camera_of(result.frame)
+    relative = np.linalg.inv(T_world_camera) @ placed.T_world_projector
+    own = relative_pose_near(relative, *correspondences_of(coords), camera, placed.projector, job.seed)
     relative[:3, 3] /= np.linalg.norm(relative[:3, 3])
     pose = replace(own, T_camera_projector=relative)  # all frames together know it better than this one alone
     try:
-        cloud: FrameCloud | None = frame_cloud(result.name, uv, job.camera_of(result.frame), placed.projector, pose)
+        return result.calibrated(frame_cloud(result.name, coords, camera, placed.projector, pose))
     except RelativePoseError as error:
-        return replace(result, stage="calibrating", reason=str(error))
-    return replace(result, cloud=cloud)
+        return result.failed("calibrating", str(error))
 
 
 def _registration(
@@ -582,7 +555,7 @@ def _registration(
     No pairs of surfaces were compared, so there are no edges.
     """
     n = len(names)
-    if n < _FEWEST:
+    if n < FEWEST_FRAMES:
         one = np.full(n, np.nan)
         exclusions = tuple(NoCommonSurface(name) for name in names)
         return Registration(
@@ -596,6 +569,8 @@ def _registration(
     )
 
 
+# All frames, with what is known of the projector and of the rig.
+
 Log = Callable[[str], None]
 
 
@@ -607,40 +582,26 @@ class CalibratedFrames:
     results: Sequence[FrameStageResult]
     found: FoundProjector | None = None  # None: the projector is the stated one
     registration: Registration | None = None  # of a projector that stands still; of the frames that have clouds
+    notes: CaptureNotes = field(default_factory=CaptureNotes)  # on the captures
 
 
 def calibrate_frames(config: ProcessConfig, inputs: Inputs, log: Log) -> CalibratedFrames:
     """Decode and calibrate all frames. Raises UserError where a projector is to be found and cannot be."""
-    job = inputs.job
+    job, found = inputs.job, None
     results = run_frame_stage(config, job, inputs.captures)
-    if job.projector_known:
-        log(describe_frame_stage(results))
-        return _as_moved(config, CalibratedFrames(job, results))
-    decoded = sum(bool(result.key) for result in results)
-    log(f"decoded {decoded} of {len(results)} frames")
-    if config.rig == "static-projector":
-        return place_static_frames(config, inputs, job, results, log)
-    found = find_projector(job, results, inputs.projector_stated)
-    log(describe(found))
-    job = replace(job, projector=found.projector, projector_known=True)
-    results = run_frame_stage_again(config, job, inputs.captures, results)
+    if config.finds_projector:
+        log(f"decoded {sum(bool(result.key) for result in results)} of {len(results)} frames")
+        if config.rig == "static-projector":
+            placed = place_static(job, results, inputs.projector_stated, config.estimate_projector)
+            if placed.found is not None:
+                log(describe(placed.found))
+            log(describe_frame_stage(placed.results))
+            return replace(placed, notes=inputs.notes)
+        found = find_projector(job, results, inputs.projector_stated)
+        log(describe(found))
+        job = replace(job, projector=found.projector, last_step="match")
+        results = run_frame_stage_again(config, job, inputs.captures, results)
     log(describe_frame_stage(results))
-    return _as_moved(config, CalibratedFrames(job, results, found))
-
-
-def place_static_frames(
-    config: ProcessConfig, inputs: Inputs, job: FrameJob, results: Sequence[FrameStageResult], log: Log
-) -> CalibratedFrames:
-    """All frames under a projector that stands still."""
-    placed = place_static(job, results, inputs.projector_stated, config.estimate_projector)
-    if placed.found is not None:
-        log(describe(placed.found))
-    job = replace(job, projector=placed.projector, projector_known=True)
-    log(describe_frame_stage(placed.results))
-    return CalibratedFrames(job, placed.results, placed.found, placed.registration)
-
-
-def _as_moved(config: ProcessConfig, calibrated: CalibratedFrames) -> CalibratedFrames:
     if config.rig == "rigid":
-        return replace(calibrated, results=with_one_pose(calibrated.job, calibrated.results))
-    return calibrated
+        results = with_one_pose(job, results)
+    return CalibratedFrames(job, results, found, notes=inputs.notes)

@@ -1,4 +1,4 @@
-"""Dataclasses with arrays as bytes, exactly, and without pickle: reading them runs no code."""
+"""Values kept between runs and on disk: decoded frames, dataclasses as bytes without pickle, clouds of many frames."""
 
 import hashlib
 import json
@@ -26,7 +26,7 @@ from sl_nerfstudio.storage import in_file, largest_in_memory, read_checked, writ
 
 # Decoded frames that are kept between runs: only changed images, patterns or decoders need decoding again.
 
-_KEY_LENGTH = 24
+KEY_LENGTH = 24  # of a digest in a file name
 MANIFEST = "manifest.json"
 DECODED = "decoded"
 
@@ -43,7 +43,7 @@ class DecodedStore:
         digest = hashlib.sha256(self._decoder_key.encode())
         for path in frame.images:
             digest.update(hashlib.sha256(read_bytes(path)).digest())
-        return digest.hexdigest()[:_KEY_LENGTH]
+        return digest.hexdigest()[:KEY_LENGTH]
 
     def load(self, frame: CapturedFrame, key: str) -> Decoded | None:
         """A frame that was decoded before; None if there is none, or if its file is damaged."""
@@ -109,6 +109,8 @@ class Manifest:
         return dict(frames) if isinstance(frames, dict) else {}
 
 
+# Dataclasses with arrays as bytes, exactly, and without pickle: reading them runs no code.
+
 T = TypeVar("T")
 _TREE = "tree"  # name of the archive's member that is no array
 
@@ -132,7 +134,7 @@ def decode(content: bytes, classes: Sequence[type]) -> Any:
 
 
 def with_arrays(value: T, classes: Sequence[type], change: Callable[[Sequence[ndarray]], Sequence[ndarray]]) -> T:
-    """The same value with other arrays in place of its own; `classes` as for `decode`."""
+    """Copy a value with other arrays in place of its own; `classes` as for `decode`."""
     arrays: list[ndarray] = []
     tree = _flat(value, arrays)
     return _built(tree, change(arrays), {kind.__name__: kind for kind in classes})

@@ -32,7 +32,7 @@ from sl_nerfstudio.registration.result import (
     UndecidedProjector,
 )
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind
-from sl_nerfstudio.review.agreement import CrossFrameAgreement, FrameCrossAgreement
+from sl_nerfstudio.review.agreement import CrossFrameAgreement
 from sl_nerfstudio.review.coverage import SurfaceShares
 from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, ScanFacts, Verdict, judge_scan, listed
 
@@ -114,9 +114,6 @@ def uncertainty_sentence(uncertainty: UncertainRotation) -> str:
     )
 
 
-# What `sl-process` says about intrinsics that the captures contradict.
-
-
 def contradiction(found: SelfCalibration | None, cameras: Sequence[Device], projector: Device) -> str:
     """Which intrinsics would agree better; "" if the captures do not contradict the stated ones."""
     if found is None or not found.contradicts():
@@ -133,25 +130,20 @@ def contradiction(found: SelfCalibration | None, cameras: Sequence[Device], proj
     )
 
 
-@dataclass(frozen=True)
-class FrameRecord:
-    """The figures of one frame, and why it was left out if it was. Figures that do not exist are None."""
+# The records.
 
-    name: str
-    in_scan: bool
-    stage: str  # in which it failed: reading, decoding, calibrating, registering, separating; "" if it did not
-    reason: str  # problem, cause and remedy
-    decode_rate: float | None = None  # of the visible pattern
-    mask_share: float | None = None
-    shared_decoded: float | None = None  # of the surface that other frames show, where this one sees the pattern
-    missing_share: float | None = None  # of the surface that other frames show in its sight: where it saw no pattern
+
+@dataclass(frozen=True)
+class FrameRecord(FrameFacts):
+    """All figures of one frame, and why it was left out if it was. Figures that do not exist are None."""
+
+    component: int = -1  # group of frames that registration connects: 0 the largest, which is in the scan; -1: none
+    stage: str = ""  # in which it failed: reading, decoding, calibrating, registering, separating; "" if it did not
+    reason: str = ""  # problem, cause and remedy
+    mask_share: float | None = None  # of the image
     epipolar_px: float | None = None  # robust standard deviation of the epipolar error, pattern pixels
-    own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's projector
     relative_sigma_rotation_deg: float | None = None  # of the projector against the camera, from this frame alone
     relative_sigma_direction_deg: float | None = None
-    component: int = -1  # group of frames that registration connects: 0 the largest, which is in the scan; -1: none
-    undecided: bool = False  # registration could not decide its pose
-    sigma_rotation_deg: float | None = None  # of the camera in the scan, 1 sigma per axis
     fitness: float | None = None  # share of the points seen by other frames, too, that agree with them
     seen_share: float | None = None  # of its points, those that other frames can judge by their coordinates
     cross_share: float | None = None  # of these, those that agree: the median over the frames it is compared with
@@ -159,7 +151,6 @@ class FrameRecord:
     cross_px_p95: float | None = None  # 95 % of the residuals are smaller
     cross_excess: float | None = None  # residual in units of what is expected, relative to the scan's better pairs
     baseline: float | None = None  # camera to projector, in the scan's unit
-    degeneracies: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -201,7 +192,7 @@ class ProcessResult:
         return sum(frame.in_scan for frame in self.frames)
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the content of processing.json."""
         return {
             "verdict": self.verdict.band,
             "reasons": list(self.verdict.reasons),
@@ -327,24 +318,19 @@ def _weak(frame: FrameRecord) -> list[str]:
 _ALONE = "too few other frames could be used"
 
 
-@dataclass(frozen=True)
-class Failure:
-    """Why a frame is not in the scan."""
+def left_out(result: FrameStageResult, registration: Registration | None) -> tuple[str, str] | None:
+    """Stage and reason of a frame that cannot be in the scan; None if it was registered.
 
-    stage: str  # reading, decoding, calibrating, registering
-    reason: str  # problem, cause and remedy
-
-
-def left_out(result: FrameStageResult, registration: Registration | None) -> Failure | None:
-    """Why a frame cannot be in the scan; None if it was registered. `registration` is None where it was not reached."""
+    `registration` is None where it was not reached.
+    """
     if result.cloud is None:
-        return Failure(result.stage, result.reason)
+        return result.stage, result.reason
     if registration is None:
-        return Failure("registering", _ALONE)
+        return "registering", _ALONE
     if registration.registered[registration.names.index(result.name)]:
         return None
     exclusion = next(e for e in registration.exclusions if e.frame == result.name)
-    return Failure("registering", exclusion_sentence(exclusion))
+    return "registering", exclusion_sentence(exclusion)
 
 
 def summarise(
@@ -357,6 +343,7 @@ def summarise(
     shares: Sequence[SurfaceShares] = (),
     found: FoundProjector | None = None,
     contradicted: str = "",
+    captured: CaptureNotes | None = None,
 ) -> ProcessResult:
     """The result of a run; without `poses` no frame is in a scan.
 
@@ -379,14 +366,14 @@ def summarise(
         remarks=(
             *([wrong] if wrong else []),
             *([found.doubt] if found and found.doubt else []),
-            *_uncertain(registration),
+            *(map(uncertainty_sentence, registration.uncertainties) if registration else ()),
         ),
         recapture=what_to_recapture(frames, records, not config.unordered),
         joint_px=None if adjusted is None else _both_known(adjusted.median_before_px, adjusted.median_after_px),
         cross_px=None if cross is None else _both_known(cross.px_median, cross.px_p95),
         verdict=judge_scan(
             ScanFacts(
-                tuple(map(_facts, frames)),
+                frames,
                 tuple(
                     PairFacts(e.frames, e.used, support_of(e.overlap, e.fitness))
                     for e in records
@@ -401,6 +388,7 @@ def summarise(
         ),
         projector=found,
         contradiction=wrong,
+        captured=captured,
         placed=place_frames(results, registration, poses),
         versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
     )
@@ -413,30 +401,18 @@ def _with_others(
     if cross is None:
         return tuple(frames)
     found = iter(zip(cross.frames, shares or [SurfaceShares(None, None)] * len(cross.frames), strict=True))
-    return tuple(_agreeing(f, *next(found)) if f.in_scan else f for f in frames)
-
-
-def _agreeing(frame: FrameRecord, found: FrameCrossAgreement, shares: SurfaceShares) -> FrameRecord:
-    figures = {"cross_share": found.share, "cross_px_median": found.px_median, "cross_px_p95": found.px_p95,
-               "cross_excess": found.excess}  # fmt: skip
-    known = {key: value for key, value in figures.items() if np.isfinite(value)}
-    return replace(frame, seen_share=found.seen, shared_decoded=shares.decoded, missing_share=shares.missing, **known)
-
-
-def _facts(frame: FrameRecord) -> FrameFacts:
-    """What the verdict judges of a frame."""
-    return FrameFacts(
-        frame.name,
-        frame.in_scan,
-        frame.component if frame.component >= 0 else None,
-        frame.undecided,
-        frame.sigma_rotation_deg,
-        frame.decode_rate,
-        frame.shared_decoded,
-        frame.missing_share,
-        frame.own_share,
-        bool(frame.degeneracies),
-    )
+    out = []
+    for frame in frames:
+        if frame.in_scan:
+            agreement, own = next(found)
+            figures = {"cross_share": agreement.share, "cross_px_median": agreement.px_median,
+                       "cross_px_p95": agreement.px_p95, "cross_excess": agreement.excess}  # fmt: skip
+            known = {key: value for key, value in figures.items() if np.isfinite(value)}
+            frame = replace(
+                frame, seen_share=agreement.seen, shared_decoded=own.decoded, missing_share=own.missing, **known
+            )
+        out.append(frame)
+    return tuple(out)
 
 
 def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames | None) -> str:
@@ -447,32 +423,24 @@ def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames
     return contradiction(adjusted.intrinsics, [cloud.camera for cloud in clouds], clouds[0].projector)
 
 
-def _uncertain(registration: Registration | None) -> tuple[str, ...]:
-    """What registration could not decide."""
-    return () if registration is None else tuple(map(uncertainty_sentence, registration.uncertainties))
-
-
 def _both_known(before: float, after: float) -> tuple[float, float] | None:
-    """None where no point of one frame was seen by another: then there is nothing to compare."""
+    """Both values; None where no point of one frame was seen by another: then there is nothing to compare."""
     return (float(before), float(after)) if np.isfinite([before, after]).all() else None
 
 
 def _record(result: FrameStageResult, registration: Registration | None, poses: ScanPoses | None) -> FrameRecord:
     """What is known of one frame."""
-    decoded = result.stage not in ("reading", "decoding")
-    rate, share = (result.decode_rate, result.mask_share) if decoded else (None, None)
-    failure, cloud = left_out(result, registration), result.cloud
-    if cloud is None:
-        return FrameRecord(result.name, False, result.stage, result.reason, rate, share)
+    cloud, failure = result.cloud, left_out(result, registration)
     if failure is None and poses is None:
-        failure = Failure("registering", _ALONE)
-    record = FrameRecord(
-        name=result.name,
-        in_scan=failure is None,
-        stage="" if failure is None else failure.stage,
-        reason="" if failure is None else failure.reason,
-        decode_rate=rate,
-        mask_share=share,
+        failure = "registering", _ALONE
+    stage, reason = failure or ("", "")
+    record = FrameRecord(result.name, failure is None, stage=stage, reason=reason)
+    if result.stage not in ("reading", "decoding"):
+        record = replace(record, decode_rate=result.decode_rate, mask_share=result.mask_share)
+    if cloud is None:
+        return record
+    record = replace(
+        record,
         epipolar_px=float(cloud.pose.residual_px),
         own_share=float(cloud.pose.inliers.mean()),
         relative_sigma_rotation_deg=cloud.pose.sigma_rotation_deg,

@@ -1,4 +1,4 @@
-"""The axes and the unit of the scan: those of given poses, of a known length, or arbitrary ones."""
+"""The axes and the unit of the scan, by given poses, a known length or neither, and where frames are in them."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -40,27 +40,16 @@ def find_scan_poses(
 
     A known length overrules the unit of given poses. Raises UserError if it is in a frame that was not registered.
     """
-    poses = ScanPoses(adjusted, "arbitrary", Scale(False))
+    units, scale = "arbitrary", Scale(False)
     if given is not None:
-        poses = _in_given_axes(poses, registration, given)
+        adjusted = adjusted.mapped(align_to(given, adjusted.poses.T_world_camera, registration.registered))
+        units = given.units
+        scale = scale if units == "arbitrary" else Scale(True, "given camera poses")
     if known is not None:
-        poses = _with_known_length(poses, clouds, known)
-    return poses
-
-
-def _in_given_axes(poses: ScanPoses, registration: Registration, given: GivenPoses) -> ScanPoses:
-    """The poses moved, turned and scaled onto the given ones."""
-    S_given_found = align_to(given, poses.adjusted.poses.T_world_camera, registration.registered)
-    scale = poses.scale if given.units == "arbitrary" else Scale(True, "given camera poses")
-    return ScanPoses(poses.adjusted.mapped(S_given_found), given.units, scale)
-
-
-def _with_known_length(poses: ScanPoses, clouds: Sequence[FrameCloud], known: KnownLength) -> ScanPoses:
-    """The poses scaled until the length is the true one."""
-    adjusted = poses.adjusted
-    devices = adjusted.poses
-    factor = scale_to(known, known.unit, clouds, devices.T_world_camera, devices.T_world_projector)
-    return ScanPoses(adjusted.scaled(factor), known.unit, stated_scale(known))
+        devices = adjusted.poses
+        factor = scale_to(known, known.unit, clouds, devices.T_world_camera, devices.T_world_projector)
+        adjusted, units, scale = adjusted.scaled(factor), known.unit, stated_scale(known)
+    return ScanPoses(adjusted, units, scale)
 
 
 def require_known_frames(known: KnownLength, clouds: Sequence[FrameCloud]) -> None:
@@ -109,7 +98,7 @@ class PlacedGroup:
     frames: tuple[PlacedFrame, ...]
 
     def only_object(self, parts: dict[str, UInt8[ndarray, "h w"]]) -> "PlacedGroup":
-        """Without the points of surroundings. `parts` is what each pixel shows (`Part`), by the frame's name."""
+        """Leave out the points of surroundings. `parts` is what each pixel shows (`Part`), by the frame's name."""
         return replace(
             self, frames=tuple(_only_object(f, parts[f.name]) if f.name in parts else f for f in self.frames)
         )

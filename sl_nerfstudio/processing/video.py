@@ -14,6 +14,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.console import track
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.processing.config import FEWEST_FRAMES
 from sl_nerfstudio.scan.document import FileError, check_file
 from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.scan.write import encode_json
@@ -112,13 +113,14 @@ def _resized(grey: UInt8[ndarray, "h w"], longest: int) -> UInt8[ndarray, "h w"]
     return np.asarray(cv2.resize(grey, (w, h), interpolation=cv2.INTER_AREA))
 
 
+# The choice of frames, kept in the work folder.
+
 ENDINGS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp")
 FOLDER = "video"  # in the work folder
 _VERSION = 1  # of the choice
 _RECORD = "chosen.json"
 _STEP = 0.04  # of the image's diagonal, between chosen frames
 _MOST = 60  # chosen frames; with more, the step grows
-_FEWEST = 2
 _RELATIVE = 0.6  # of the sharpness of the video's sharp frames: less is blurred by motion
 
 
@@ -145,7 +147,7 @@ class VideoChoice:
     chosen: tuple[ChosenFrame, ...]
 
     def sentences(self) -> list[str]:
-        """For the output and the report."""
+        """Describe the choice for the output and the report."""
         numbers = ", ".join(str(frame.number) for frame in self.chosen)
         return [
             f"{self.file}: {len(self.chosen)} of {self.frames_in_video} frames were chosen: numbers {numbers}",
@@ -154,7 +156,7 @@ class VideoChoice:
         ]
 
     def document(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the record as JSON."""
         return asdict(self)
 
 
@@ -199,7 +201,7 @@ def _choose(path: Path, measures: Sequence[FrameMeasure]) -> VideoChoice:
     sharpness = np.array([m.sharpness for m in measures])
     least = max(SHARP, _RELATIVE * float(np.percentile(sharpness, 90)))
     sharp = sharpness >= least
-    if sharp.sum() < _FEWEST:
+    if sharp.sum() < FEWEST_FRAMES:
         raise FileError(
             path,
             f"has no two sharp frames (the sharpest: {sharpness.max():.2f}, at least {SHARP:g} is needed)",
@@ -223,7 +225,7 @@ def _choose(path: Path, measures: Sequence[FrameMeasure]) -> VideoChoice:
         figures = (round(float(sharpness[k]), 4), round(moved, 5))
         chosen.append(ChosenFrame(f"video_{measures[k].number:06d}", measures[k].number, measures[k].time_s, *figures))
         last = float(way[k])
-    if len(chosen) < _FEWEST:
+    if len(chosen) < FEWEST_FRAMES:
         raise FileError(
             path,
             f"moves by {way[-1]:.1%} of the image's diagonal only: {len(chosen)} frame was chosen",
@@ -272,7 +274,7 @@ def _decoded(path: Path, kind: str) -> Iterator[tuple[int, float, UInt8[ndarray,
 
 
 def _digest(path: Path) -> str:
-    """Of the file and of how frames are chosen."""
+    """Digest of the file and of how frames are chosen."""
     found = hashlib.sha256(f"{_VERSION} {_STEP} {_MOST} {SHARP} {_RELATIVE}".encode())
     with path.open("rb") as stream:
         while part := stream.read(1 << 20):

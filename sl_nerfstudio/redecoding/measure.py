@@ -13,9 +13,8 @@ from sl_nerfstudio.parallel import compiled, compiled_range
 # Correlation of an image with a pattern in a window about each pixel, on one surface, whatever gain and offset.
 #
 # A window holds the pixels that lie on the same surface as its centre: a depth that differs by more than a steep
-# surface
-# would is another surface. The pattern is looked up at predicted coordinates, which bend and foreshorten it as the
-# surface does; what is left is one displacement for the whole window.
+# surface would is another surface. The pattern is looked up at predicted coordinates, which bend and foreshorten it as
+# the surface does; what is left is one displacement for the whole window.
 
 STEEPEST = 6.0  # pixel widths of depth from one pixel to the next on one surface: seen at 9 degrees from its plane
 _ROUNDS = 4
@@ -241,7 +240,7 @@ class Ambiguity:
 
     @staticmethod
     def of(pattern: Float32[ndarray, "h w"]) -> "Ambiguity":
-        """From the autocorrelation of the whole pattern."""
+        """Find the displacements from the autocorrelation of the whole pattern."""
         h, w = pattern.shape
         alike = _autocorrelation(pattern)
         y, x = np.mgrid[: alike.shape[0], : alike.shape[1]]
@@ -267,7 +266,7 @@ class Ambiguity:
 
 
 def _autocorrelation(pattern: Float32[ndarray, "h w"]) -> Float64[ndarray, "h w"]:
-    """Of displacements up to half the pattern's size, the one of zero in the middle (h // 2, w // 2)."""
+    """Autocorrelation at displacements up to half the pattern's size; zero displacement is at (h // 2, w // 2)."""
     h, w = pattern.shape
     one = np.fft.rfft2(np.ones_like(pattern), (2 * h, 2 * w))
     centred = np.fft.rfft2(pattern - pattern.mean(), (2 * h, 2 * w))
@@ -385,8 +384,7 @@ def _spread(
 
 # Which measured coordinates are accepted: limits learnt from the pixels of the frame that were decoded before.
 #
-# Where the decoder and the image agree, it is known what a right match looks like in this frame. What a wrong one
-# looks
+# Where the decoder and the image agree, it is known what a right match looks like in this frame. What a wrong one looks
 # like is seen by looking for the pattern where it certainly is not.
 
 AGREES = 1 / 6  # pitch: decoded and measured coordinates that differ less are the same

@@ -205,7 +205,7 @@ def _redecode(
     pitch_px: float,
     facts: RedecodedFacts,
 ) -> tuple[Float32[ndarray, "h w 2"], RedecodedFacts]:
-    """The same for a view of which some decoded pixels are usable; `facts` has the numbers before."""
+    """Decode a view again of which some decoded pixels are usable; `facts` has the numbers before."""
     pitch, old = ambiguity.pitch, np.isfinite(decoded).all(-1)
     checked = view.usable & old & _thinned(view.usable & old)
     # A decoded pixel that is as predicted stays as it is: it is measured only to learn from it.
@@ -344,15 +344,9 @@ def _without_specks(
     return out
 
 
+# A whole run: a new scan folder with the coordinates of all frames.
+
 RECORD = "redecoding.json"
-
-
-@dataclass(frozen=True)
-class RedecodeSettings:
-    """Where the new scan goes, and how finely the surface is extracted."""
-
-    output: Path  # a folder that is new or empty
-    resolution: int = 256  # cells along each side of the scene's box
 
 
 @dataclass(frozen=True)
@@ -380,8 +374,10 @@ class Redecoded:
 
 
 @one_library_thread()
-def redecode_run(run: TrainedRun, settings: RedecodeSettings) -> Redecoded:
+def redecode_run(run: TrainedRun, output: Path, resolution: int = 256) -> Redecoded:
     """Write the scan of a run with coordinates that were decoded again; one frame is in memory at a time.
+
+    `output` is a folder that is new or empty, `resolution` the number of cells along each side of the scene's box.
 
     All else is copied: images, masks, truth, and the starting poses with their sigma. Those are independent of the
     coordinates, while the refined ones already contain them: as a prior they would count the coordinates twice.
@@ -390,10 +386,9 @@ def redecode_run(run: TrainedRun, settings: RedecodeSettings) -> Redecoded:
     model = run.model
     scan, poses = model.scan, model.poses()
     document = read_document(scan.root / TRANSFORMS)
-    with NewFolder(settings.output) as folder:
-        surface = PredictedSurface(
-            extract_mesh(model.sdf, settings.resolution, device=model.device).mapped(model.S_scene_world.inverse())
-        )
+    with NewFolder(output) as folder:
+        mesh = extract_mesh(model.sdf, resolution, device=model.device)
+        surface = PredictedSurface(mesh.mapped(model.S_scene_world.inverse()))
         pattern = scan.read_pattern()
         ambiguity, facts = Ambiguity.of(pattern), []
         for k, frame in enumerate(track(scan.frames, "decoding again")):
@@ -408,7 +403,8 @@ def redecode_run(run: TrainedRun, settings: RedecodeSettings) -> Redecoded:
             facts.append(found)
         _copy_others(folder, scan, document)
         result = Redecoded(tuple(facts))
-        folder.write(RECORD, encode_json(_record(result)))
+        record = {"share_before": result.share_before, "share_after": result.share_after}
+        folder.write(RECORD, encode_json({**record, "frames": [dataclasses.asdict(frame) for frame in result.frames]}))
         folder.write(TRANSFORMS, encode_json(document), last=True)
     return result
 
@@ -435,11 +431,3 @@ def _copy_others(folder: NewFolder, scan: Scan, document: Record) -> None:
     others = [path.relative_to(scan.root).as_posix() for path in (*truth, *beside)]
     for path in track(dict.fromkeys([*named, *others]), "copying"):
         folder.write(path, read_bytes(scan.root / path))
-
-
-def _record(result: Redecoded) -> dict:
-    return {
-        "share_before": result.share_before,
-        "share_after": result.share_after,
-        "frames": [dataclasses.asdict(frame) for frame in result.frames],
-    }

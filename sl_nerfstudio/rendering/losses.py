@@ -1,6 +1,6 @@
-"""The losses of training.
+"""The losses of training, and what changes during it: sharpness of the surface and the levels of the grid.
 
-Lengths are in scene units (the object's radius is about one), so nothing depends on the scan's unit.
+Lengths are in scene units (the object's radius is 0.8), so nothing depends on the scan's unit.
 """
 
 import math
@@ -8,20 +8,17 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
+import tyro
 from jaxtyping import Bool, Float
 from torch import Tensor
-
-# Settings of losses and of samples along rays.
 
 
 @dataclass
 class LossConfig:
-    """Weights of the losses. Lengths are in scene units (the object's radius is 0.8)."""
+    """Weights of the losses."""
 
     coordinates: float = 0.1
     """Weight of the rendered coordinates' L1 error, converted to a length by the scan's median depth sensitivity."""
-    coordinates_per_pixel: float | None = None
-    """If set, the weight of the coordinates' L1 error in pattern pixels, used instead of `coordinates`."""
     pattern: float = 0.005
     """Weight of the pattern term, 1 - cosine of rendered and captured intensities."""
     eikonal: float = 0.1
@@ -30,6 +27,8 @@ class LossConfig:
     """Weight of the direct term |f| at triangulated points."""
     free_space: float = 1.0
     """Weight of the sign terms: positive in front of a triangulated point, negative just behind it."""
+    coordinates_per_pixel: tyro.conf.Suppress[float | None] = None
+    """Weight of the coordinates' L1 error in pattern pixels, used instead of `coordinates` by the paper's method."""
 
     @property
     def direct(self) -> bool:
@@ -37,24 +36,13 @@ class LossConfig:
         return self.surface != 0 or self.free_space != 0
 
 
-@dataclass
-class SamplingConfig:
-    """Where the field is evaluated in a training step."""
+KappaGrowth = Literal["geometric", "linear", "constant"]
 
-    strategy: Literal["surface", "uniform"] = "surface"
-    """`surface`: around the crossing found in a cached coarse grid; `uniform`: along the whole ray."""
-    samples: int = 16
-    """Samples per ray for volume rendering."""
-    half_width: float = 4.0
-    """Half the interval sampled around the surface, in units of 1 / kappa (plus one cell of the cached grid)."""
-    render_rays: int = 256
-    """Rays of a batch that are volume rendered; the direct terms use all of the batch's decoded rays."""
-    eikonal_points: int = 1024
-    """Random points of the scene at which the Eikonal term is evaluated, besides the surface points."""
-
-
-# What changes during training: sharpness of the surface and the levels of the grid.
-
+# Sharpness of the surface, per scene unit; `linear` is the paper's.
+KAPPA_START, KAPPA_END = 32.0, 400.0
+_LINEAR_KAPPA_END, _KAPPA_PER_STEP = 200.0, 0.02
+LEVELS_AT_START = 2  # levels of the grid that are used from the first step
+ALL_LEVELS_AT = 0.4  # share of the run after which all levels have full weight
 _WIDTH_START, _WIDTH_END = 0.2, 0.02  # scene units: kernel width of the surface term over the run
 
 
@@ -62,32 +50,21 @@ _WIDTH_START, _WIDTH_END = 0.2, 0.02  # scene units: kernel width of the surface
 class AnnealingConfig:
     """How sharpness and detail grow."""
 
-    kappa_start: float = 32.0
-    """Sharpness of the surface at the start, per scene unit."""
-    kappa_end: float = 400.0
-    """Sharpness at the end of the run, per scene unit."""
-    kappa_growth: Literal["geometric", "linear"] = "geometric"
-    """How kappa goes from start to end: `geometric` over the run's length, or `linear` by `kappa_per_step`."""
-    kappa_per_step: float = 0.02
-    """Increase of kappa in each step where growth is linear."""
-    anneal_kappa: bool = True
-    """Off: kappa has its end value throughout."""
+    kappa: KappaGrowth = "geometric"
+    """Sharpness of the surface: `geometric` growth over the run, `linear` with the steps (the paper's), or `constant`
+    at its end value."""
     coarse_to_fine: bool = True
     """Fade in the grid's finer levels one after the other; off: use all levels from the first step."""
-    levels_at_start: int = 2
-    """Levels of the grid that are used from the first step."""
-    all_levels_at: float = 0.4
-    """Share of the run after which all levels have full weight."""
 
 
-def kappa_at(config: AnnealingConfig, step: int, total: int) -> float:
-    """Sharpness at a step."""
-    if not config.anneal_kappa:
-        return config.kappa_end
-    if config.kappa_growth == "linear":
-        return min(config.kappa_start + config.kappa_per_step * step, config.kappa_end)
+def kappa_at(growth: KappaGrowth, step: int, total: int) -> float:
+    """Sharpness at a step, per scene unit."""
+    if growth == "constant":
+        return KAPPA_END
+    if growth == "linear":
+        return min(KAPPA_START + _KAPPA_PER_STEP * step, _LINEAR_KAPPA_END)
     share = min(step / max(total, 1), 1.0)
-    return config.kappa_start * math.exp(share * math.log(config.kappa_end / config.kappa_start))
+    return KAPPA_START * math.exp(share * math.log(KAPPA_END / KAPPA_START))
 
 
 def surface_width_at(step: int, total: int) -> float:
@@ -100,8 +77,8 @@ def level_weights_at(config: AnnealingConfig, levels: int, step: int, total: int
     """Weight of each level at a step: finer ones fade in one after the other, each by a half cosine."""
     if not config.coarse_to_fine:
         return torch.ones(levels)
-    late = max(levels - config.levels_at_start, 0)
-    share = min(step / max(total * config.all_levels_at, 1e-9), 1.0) * late + config.levels_at_start
+    late = max(levels - LEVELS_AT_START, 0)
+    share = min(step / max(total * ALL_LEVELS_AT, 1e-9), 1.0) * late + LEVELS_AT_START
     ramp = (share - torch.arange(levels, dtype=torch.float64)).clamp(0, 1)
     return (0.5 - 0.5 * torch.cos(math.pi * ramp)).float()
 

@@ -2,15 +2,16 @@
 
 from dataclasses import dataclass
 from math import ceil
+from typing import Literal
 
 import torch
+import tyro
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from sl_nerfstudio.field.field import CachedGrid
 from sl_nerfstudio.field.hash_grid import SignedDistance
 from sl_nerfstudio.geometry.devices import Intrinsics
-from sl_nerfstudio.rendering.losses import SamplingConfig
 from sl_nerfstudio.rendering.volume_rendering import (
     Rendered,
     comes_below,
@@ -22,6 +23,7 @@ from sl_nerfstudio.rendering.volume_rendering import (
     uniform_samples,
 )
 
+HALF_WIDTH = 4.0  # half the interval sampled around the surface, times 1 / kappa; plus one cell of the cached grid
 CACHE_SAMPLES = 64  # along a ray, to find the surface
 _SHADOW_SAMPLES = 32
 _NEAR_SAMPLES = 32  # along a ray, to find out whether it passes the surface
@@ -31,6 +33,20 @@ _AROUND_SURFACE = 12  # likewise, where they do: the fewest
 
 Ends = tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]
 """Distances at which rays begin and end, for textures and cropped views."""
+
+
+@dataclass
+class SamplingConfig:
+    """Where the field is evaluated in a training step."""
+
+    render_rays: int = 256
+    """Rays of a batch that are volume rendered; the direct terms use all of the batch's decoded rays."""
+    eikonal_points: int = 1024
+    """Random points of the scene at which the Eikonal term is evaluated, besides the surface points."""
+    strategy: tyro.conf.Suppress[Literal["surface", "uniform"]] = "surface"
+    """`surface`: around the crossing found in a cached coarse grid; `uniform`: along the whole ray (the paper's)."""
+    samples: tyro.conf.Suppress[int] = 16
+    """Samples per ray for volume rendering."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +104,7 @@ class Renderer:
     @property
     def _reach(self) -> Float[Tensor, ""] | float:
         """How far from the surface a sample still counts, with the error of the cached grid."""
-        return self.sampling.half_width / self.kappa + self.cache.cell
+        return HALF_WIDTH / self.kappa + self.cache.cell
 
     @torch.no_grad()
     def _distances(

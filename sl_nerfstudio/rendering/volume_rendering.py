@@ -74,8 +74,7 @@ def first_crossing(
 # Rendering without gradients on the CPU: the formulas of volume_rendering.py and of the cached grid, compiled.
 #
 # An image has a hundred times the samples of a training step. As torch operations, each of which writes an array as
-# large
-# as all samples, they take ten times as long.
+# large as all samples, they take ten times as long.
 
 EPSILON = 1e-6  # beside the weights that a ray's values are divided by
 

@@ -17,7 +17,8 @@ from sl_nerfstudio.geometry.devices import MODELS, Intrinsics
 from sl_nerfstudio.rendering import warp_kernels as direct_kernels
 from sl_nerfstudio.rendering import warp_kernels as point_kernels
 from sl_nerfstudio.rendering import warp_kernels as ray_kernels
-from sl_nerfstudio.rendering.losses import LossConfig, SamplingConfig
+from sl_nerfstudio.rendering.losses import LossConfig
+from sl_nerfstudio.rendering.renderer import HALF_WIDTH, SamplingConfig
 
 _SUMS = 14  # see the kernels; the last one stays 0
 
@@ -168,7 +169,7 @@ class _Points(torch.autograd.Function):
         launch(point_kernels.rays_and_random_points, max(rays, m), *table, T_scene_camera, *cameras, *found)
         weight, at_least = empty(n), empty(n)
         if r:
-            surface = (int(step.sampling.strategy == "surface"), 2 / (len(step.cache) - 1), step.sampling.half_width)
+            surface = (int(step.sampling.strategy == "surface"), 2 / (len(step.cache) - 1), HALF_WIDTH)
             where = (step.cache, *surface, current.kappa.reshape(1))
             launch(point_kernels.sample, r, origins, directions, noise, *where, t, points)
         if n:

@@ -179,14 +179,14 @@ class FrameFacts:
 
     name: str
     in_scan: bool = True
-    component: int | None = 0  # group of frames that registration connects: 0 the largest; None: none
+    component: int | None = 0  # group of frames that registration connects: 0 the largest; None or -1: none
     undecided: bool = False  # registration could not decide its pose
     sigma_rotation_deg: float | None = None  # of the camera in the scan, 1 sigma per axis
-    decoded_share: float | None = None  # of the visible pattern
+    decode_rate: float | None = None  # of the visible pattern
     shared_decoded: float | None = None  # of the surface that other frames show, where this one sees the pattern
     missing_share: float | None = None  # of the surface that other frames show in its sight: where it saw no pattern
     own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's own projector
-    degenerate: bool = False  # the pose of its projector is determined weakly by the frame itself
+    degeneracies: tuple[str, ...] = ()  # why the frame itself determines the pose of its projector only weakly
 
 
 @dataclass(frozen=True)
@@ -254,7 +254,7 @@ def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
         yield from cross_reasons([f.name for f in facts.in_scan], facts.cross)
     yield from _decoding(facts)
     yield from _missing(facts)
-    degenerate = [f.name for f in facts.in_scan if f.degenerate]
+    degenerate = [f.name for f in facts.in_scan if f.degeneracies]
     if len(degenerate) > _MOST_FRAMES * len(facts.in_scan):
         yield Reason("acceptable", f"the pose of the projector is weakly determined in {listed(degenerate)}")
     if not facts.adjusted:
@@ -270,7 +270,7 @@ def _left_out(facts: ScanFacts) -> Iterator[Reason]:
     """Frames that are not in the scan: those that form groups of their own, and single ones."""
     lost = [f for f in facts.frames if not f.in_scan]
     band = _share_band(len(lost), len(facts.frames))
-    apart = sorted({f.component for f in lost if f.component})
+    apart = sorted({f.component for f in lost if f.component and f.component > 0})
     for number in apart:
         names = [f.name for f in lost if f.component == number]
         yield Reason(
@@ -278,7 +278,7 @@ def _left_out(facts: ScanFacts) -> Iterator[Reason]:
             f"{listed(names)}: {'form a group of their own' if len(names) > 1 else 'stands alone'}; the connection to "
             "the other frames is not certain, so they are not in the scan",
         )
-    single = [f.name for f in lost if not f.component]
+    single = [f.name for f in lost if f.component not in apart]
     if single:
         yield Reason(band, f"{len(single)} of {len(facts.frames)} frames were left out: {listed(single)}")
 
@@ -442,7 +442,7 @@ def _decoding(facts: ScanFacts) -> Iterator[Reason]:
     """Frames with little decoded, and frames whose coordinates contradict their own pose."""
     own = "of the decoded pixels agree with the pose of the projector"
     seen = [(f.shared_decoded, f) for f in facts.in_scan]
-    alone = [(f.decoded_share, f) for f in facts.in_scan if f.shared_decoded is None]
+    alone = [(f.decode_rate, f) for f in facts.in_scan if f.shared_decoded is None]
     for shares, least, words in (
         (seen, _LEAST_DECODED, "of the surface that other frames show was decoded"),
         (alone, _LEAST_DECODED, "of the visible pattern was decoded"),

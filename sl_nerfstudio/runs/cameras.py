@@ -312,8 +312,7 @@ def encode_colmap(frames: PosedFrames, root: Path, tracks: SurfaceTracks) -> dic
         ),
         "cameras.txt": _colmap_text("# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; the last one is the projector", cameras),
         "images.txt": _colmap_text(
-            "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then (X Y POINT3D_ID)[]; world to device, +y down",
-            images,
+            "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then (X Y POINT3D_ID)[]; world to device, +y down", images
         ),
         "points3D.txt": _colmap_text(
             "# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID POINT2D_IDX)", _tracks(tracks, placed)

@@ -36,8 +36,8 @@ from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties
 from sl_nerfstudio.meshing.texture import Colours, Textured, has_pictures, surface_texture, vertex_colours
 from sl_nerfstudio.meshing.uncertainty import vertex_uncertainty
 from sl_nerfstudio.meshing.visibility import Trimmed, trim_to_observed
+from sl_nerfstudio.model.model import RECOMMENDED_STEPS
 from sl_nerfstudio.model.run_files import plain
-from sl_nerfstudio.model.settings import RECOMMENDED_STEPS
 from sl_nerfstudio.object_separation.planes import DecodedFrame, PlaneFinding
 from sl_nerfstudio.object_separation.separate import PIXELS_PER_FRAME, Separation, separate
 from sl_nerfstudio.parallel import one_library_thread

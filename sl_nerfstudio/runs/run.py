@@ -1,4 +1,4 @@
-"""What a run's folder holds, without running anything from it: for runs from elsewhere, and before an export."""
+"""A trained run: its config.yml, read without running anything from it, its checkpoint, and its model."""
 
 import enum
 import json
@@ -9,28 +9,23 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path, PosixPath
-from typing import Any, Literal, Protocol, Union, cast, get_args, get_origin, get_type_hints, runtime_checkable
+from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
 import yaml
-from jaxtyping import Float
-from numpy import ndarray
-from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
-from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
 from sl_nerfstudio.dataparser.dataparser import scan_fingerprint, scan_root
 from sl_nerfstudio.errors import UserError, first_line, last_line
-from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
-from sl_nerfstudio.late_imports import compiler_on_demand, shapes_without_symbols
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.model.model import SLModelConfig
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
+from sl_nerfstudio.model.outputs import TrainedModel
 from sl_nerfstudio.model.pipeline import SLPipelineConfig, require_together
 from sl_nerfstudio.model.run_files import Checkpoint, checkpoints_in, read_checkpoint, settings_fingerprint
 from sl_nerfstudio.model.trainer import SLTrainerConfig
-from sl_nerfstudio.scan import Scan, read_scan
+from sl_nerfstudio.scan import read_scan
 
 # config.yml of a run, read without running anything from it: only the settings of this package's runs are made.
 #
@@ -54,6 +49,13 @@ def read_config(path: Path) -> SLTrainerConfig:
             raise ValueError(f"it has {path.stat().st_size / 1e6:.0f} MB")
         config = yaml.load(path.read_text(encoding="utf-8"), Loader=_ConfigLoader)
     except _NotExpected as error:
+        if error.earlier:
+            raise UserError(
+                f"{path}, line {error.line}: this run was trained by an earlier version of this package\n"
+                f"    cause:  {error.problem}\n"
+                "    remedy: train again with this version, which reads the scan folder as before, or open it with "
+                "the one that trained it"
+            ) from error
         raise UserError(
             f"{path}, line {error.line}: {error.problem}\n"
             "    cause:  it is not a run of sl-neus or sl-neus-paper, is of another version of this package, or "
@@ -89,6 +91,13 @@ class _NotExpected(Exception):
 
     def __init__(self, node: yaml.Node, problem: str) -> None:
         self.line, self.problem = node.start_mark.line + 1, problem
+        self.earlier = False  # whether it is a class or a setting that this package no longer has
+
+
+def _no_longer(node: yaml.Node, problem: str) -> _NotExpected:
+    found = _NotExpected(node, problem)
+    found.earlier = True
+    return found
 
 
 @dataclass(frozen=True)
@@ -118,6 +127,10 @@ def _name(kind: type) -> str:
     return f"{kind.__module__}.{kind.__name__}"
 
 
+def _is_ours(name: str) -> bool:
+    return name.startswith(f"{__name__.partition('.')[0]}.")
+
+
 def _parts(value: Any) -> Iterator[Any]:
     yield value
     if is_dataclass(value) and not isinstance(value, type):
@@ -142,6 +155,8 @@ class _ConfigLoader(yaml.SafeLoader):
 
     def settings(self, name: str, node: yaml.Node) -> Any:
         """An instance of an expected class, with exactly its fields and with values of their types."""
+        if _is_ours(name) and name not in _expected().settings:
+            raise _no_longer(node, f"there is no class {name} of settings any more")
         if name not in _expected().settings or not isinstance(node, yaml.MappingNode):
             raise _NotExpected(node, f"{name} is not a class of settings that is expected here")
         kind = type(_expected().settings[name])
@@ -149,7 +164,9 @@ class _ConfigLoader(yaml.SafeLoader):
         names, hints = [field.name for field in fields(kind)], _hints(name)
         for key, item in node.value:
             if key.value not in names:
-                raise _NotExpected(key, f"{kind.__name__} has no setting {key.value!r}")
+                raise (_no_longer if _is_ours(name) else _NotExpected)(
+                    key, f"{kind.__name__} has no setting {key.value!r}"
+                )
             if not _fits(values[key.value], hints[key.value]):
                 raise _NotExpected(item, f"{values[key.value]!r:.100} is no value for {kind.__name__}.{key.value}")
         missing = [name for name in names if name not in values]
@@ -171,6 +188,8 @@ class _ConfigLoader(yaml.SafeLoader):
 
     def named(self, name: str, node: yaml.Node) -> type:
         """One of the classes that settings are for."""
+        if _is_ours(name) and name not in _expected().targets:
+            raise _no_longer(node, f"there is no class {name} any more")
         if name not in _expected().targets:
             raise _NotExpected(node, f"{name} is not a class that is expected here")
         return _expected().targets[name]
@@ -225,52 +244,6 @@ def _fits(value: Any, hint: Any) -> bool:
 _SAME_SCENE = 1e-3  # scene units: far above the rounding of float32, far below what is visible
 
 
-@runtime_checkable
-class TrainedModel(Protocol):
-    """What an export needs from a model; poses are in the scan's world and unit, the field is in the scene frame."""
-
-    scan: Scan
-    S_scene_world: Similarity
-
-    @property
-    def cell(self) -> float:
-        """Length of the field's finest cells, in the scan's unit."""
-        ...
-
-    @property
-    def device(self) -> torch.device:
-        """Where the field is evaluated."""
-        ...
-
-    def sdf(self, p_scene: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-        """Signed distance in scene units."""
-        ...
-
-    def poses(self) -> DevicePoses:
-        """Poses of cameras and projectors."""
-        ...
-
-    def pose_sigma(self) -> Float[ndarray, "frames 4"] | None:
-        """One sigma of each frame's poses, in the order of PoseSigma's fields; None if it was not estimated."""
-        ...
-
-    def joint_covariance(self) -> JointCovariance | None:
-        """Covariance of all poses and the intrinsics in the scan's world and unit; None if it was not estimated."""
-        ...
-
-    def unplaced(self) -> list[bool]:
-        """Of each frame, whether it does not agree with the others."""
-        ...
-
-    def self_calibration(self) -> SelfCalibration | None:
-        """How well the intrinsics agree with the captures; None where poses were not adjusted."""
-        ...
-
-    def history(self) -> dict[str, list[float]]:
-        """Convergence curves, with the steps under `step`."""
-        ...
-
-
 @dataclass(frozen=True)
 class TrainedRun:
     """A model with the settings it was trained under."""
@@ -287,7 +260,7 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     folder was moved is found next to its config.yml, and `data` gives the scan folder if that was moved.
     Raises UserError for anything missing, broken or made by another method.
     """
-    with warnings.catch_warnings(), compiler_on_demand():
+    with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, at its import
         from sl_nerfstudio.dataparser.dataparser import load_scan
         from sl_nerfstudio.model.pipeline import SLPipeline, require_together
@@ -307,8 +280,7 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     device = "cuda" if torch.cuda.is_available() else "cpu"
     loaded = load_scan(root, config.pipeline.datamanager.dataparser.intrinsics_change)
     require_together(config.pipeline, checkpoint.weights, root, loaded.fingerprint)
-    with shapes_without_symbols():
-        pipeline: Any = SLPipeline(config.pipeline, device, test_mode="inference")
+    pipeline: Any = SLPipeline(config.pipeline, device, test_mode="inference")
     _require_same_keys(checkpoint.path, checkpoint.weights, pipeline.state_dict())
     try:
         pipeline.load_pipeline(checkpoint.weights, checkpoint.step)

@@ -218,11 +218,7 @@ def check_pattern(partial: PartialScan, good: set[Path], faults: Faults) -> Patt
 
 
 def check_content(
-    frame: PartialFrame,
-    partial: PartialScan,
-    pattern: PatternImage | None,
-    good: set[Path],
-    faults: Faults,
+    frame: PartialFrame, partial: PartialScan, pattern: PatternImage | None, good: set[Path], faults: Faults
 ) -> FrameContent:
     """Decode all files of a frame that are in `good`, and report what is wrong with their pixels."""
     image_path, pattern_path, coords_path, mask_path = (
@@ -234,9 +230,13 @@ def check_content(
     decoded = None if coords is None else np.isfinite(coords[..., 0])  # and so is the other, or it would be a fault
     where = decoded if mask is None else mask
     both = None if decoded is None else (decoded if mask is None else decoded & mask)
-    if mask_path and coords_path and mask is not None and decoded is not None:
-        for problem in _together_problems(mask, decoded):
-            faults.add(problem, relative(mask_path, partial.root), frame.name)
+    if mask_path and mask is not None and decoded is not None and _excludes_all(mask, decoded):
+        problem = Problem(
+            "excludes every pixel that has coordinates",
+            "it is inverted, or is the mask of another frame",
+            "mark with 255 where the pattern falls on the object, with 0 elsewhere",
+        )
+        faults.add(problem, relative(mask_path, partial.root), frame.name)
     image = None if image_path is None else _read_image(image_path, partial, frame.name, faults)
     shown, shown_path = image, image_path
     if "sl_pattern_path" in frame.paths:
@@ -356,36 +356,27 @@ def _check_color(
     color = _read_image(path, partial, frame.name, faults) if path is not None and path in good else None
     if path is None or color is None:
         return
+    problem = None
     if color.min() == color.max():
-        faults.add(_EMPTY_PICTURE, relative(path, partial.root), frame.name)
+        problem = Problem(
+            "has the same value everywhere",
+            "a covered lens, or a dark room while the projector was off",
+            "take the picture in even light, or leave sl_color_path out",
+        )
     elif match is not None and where is not None:
         correlation = match.prediction.correlation(as_grey(color), where)
         if correlation >= CLEAR:
-            faults.add(_shows_pattern(correlation), relative(path, partial.root), frame.name)
+            problem = Problem(
+                f"shows the pattern (correlation {correlation:.2f})",
+                "it was taken with the pattern, or is another file",
+                "give the picture that was taken without the pattern, or leave sl_color_path out",
+            )
+    if problem is not None:
+        faults.add(problem, relative(path, partial.root), frame.name)
 
 
-_EMPTY_PICTURE = Problem(
-    "has the same value everywhere",
-    "a covered lens, or a dark room while the projector was off",
-    "take the picture in even light, or leave sl_color_path out",
-)
-
-
-def _shows_pattern(correlation: float) -> Problem:
-    return Problem(
-        f"shows the pattern (correlation {correlation:.2f})",
-        "it was taken with the pattern, or is another file",
-        "give the picture that was taken without the pattern, or leave sl_color_path out",
-    )
-
-
-def _together_problems(mask: Bool[ndarray, "h w"], decoded: Bool[ndarray, "h w"]) -> Iterator[Problem]:
-    if mask.shape == decoded.shape and decoded.any() and not (mask & decoded).any():
-        yield Problem(
-            "excludes every pixel that has coordinates",
-            "it is inverted, or is the mask of another frame",
-            "mark with 255 where the pattern falls on the object, with 0 elsewhere",
-        )
+def _excludes_all(mask: Bool[ndarray, "h w"], decoded: Bool[ndarray, "_ _"]) -> bool:
+    return mask.shape == decoded.shape and bool(decoded.any()) and not (mask & decoded).any()
 
 
 def _read_image(path: Path, partial: PartialScan, frame: str | None, faults: Faults) -> ndarray | None:
@@ -454,7 +445,8 @@ def check_folder(root: Path) -> FolderCheck:
     found = faults.found
     scan = None if found else partial.complete()
     if scan is not None:
-        found = _faults_raised(lambda: _measure_scale_bar(scan)) + [
+        bar = scan.scale.bar
+        found = _faults_raised(lambda: bar and measured_length(scan, bar, scan.poses)) + [
             replace(fault, file=f"{GROUND_TRUTH}/{fault.file}")
             for fault in _faults_raised(lambda: read_ground_truth(scan))
         ]
@@ -465,13 +457,9 @@ def check_folder(root: Path) -> FolderCheck:
 
 
 def _contents(
-    frames: Sequence[PartialFrame],
-    partial: PartialScan,
-    pattern: PatternImage | None,
-    good: set[Path],
-    faults: Faults,
+    frames: Sequence[PartialFrame], partial: PartialScan, pattern: PatternImage | None, good: set[Path], faults: Faults
 ) -> Iterator[FrameContent]:
-    """In threads; the faults come in the order of the frames, whichever was done first."""
+    """Check frames in threads; the faults come in the order of the frames, whichever was done first."""
     together = threads()
     for first in range(0, len(frames), together):
         group = frames[first : first + together]
@@ -518,12 +506,6 @@ def _check_images(
     for content in contents:
         if content.name in found and not {content.name, None} & explained:
             faults.add(found[content.name], TRANSFORMS, content.name, "sl_coords_path")
-
-
-def _measure_scale_bar(scan: Scan) -> None:
-    """Raises ScanError if training could not measure the scan's scale bar."""
-    if scan.scale.bar is not None:
-        measured_length(scan, scan.scale.bar, scan.poses)
 
 
 def _faults_raised(read: Callable[[], object]) -> list[Fault]:

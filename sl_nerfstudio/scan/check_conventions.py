@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float, Float32, Float64
 from numpy import ndarray
 from scipy.spatial import KDTree
 from torch import Tensor
@@ -146,7 +146,7 @@ def apply_interpretation(interpretation: Interpretation, frame: Correspondences,
         frame,
         T_world_camera=_converted_pose(frame.T_world_camera, interpretation.camera),
         T_world_projector=T_world_projector,
-        uv_projector=_converted_coords(frame.uv_projector, interpretation, projector),
+        uv_projector=converted_coords(frame.uv_projector, interpretation, (projector.w, projector.h)),
     )
 
 
@@ -166,14 +166,11 @@ def fit_geometry(frames: Sequence[Correspondences], projector: Device) -> Geomet
     points = triangulate(*geometry)
     depth = float(points.depth_camera[in_front].median()) if in_front.any() else 0.0
     count = max(_FEWEST_CLOUD_POINTS, min(_CLOUD_POINTS, _MOST_POINTS // len(frames)))
-    clouds = tuple(_thin(p[ok].numpy(), count) for p, ok in zip(points.p_world, in_front, strict=True))
+    seen = [p[ok].numpy() for p, ok in zip(points.p_world, in_front, strict=True)]
+    clouds = tuple(cloud[:: max(1, len(cloud) // count)] for cloud in seen)
     others = OtherClouds(clouds)
     spread = [others.distance(cloud, index) for index, cloud in enumerate(clouds)]
     return GeometricFit(residual.median(-1).values.numpy(), np.array(spread) / max(depth, 1e-300), depth, clouds)
-
-
-def _thin(cloud: Float64[ndarray, "n 3"], count: int) -> Float64[ndarray, "_ 3"]:
-    return cloud[:: max(1, len(cloud) // count)]
 
 
 def _converted_pose(T: Float64[ndarray, "4 4"], convention: PoseConvention) -> Float64[ndarray, "4 4"]:
@@ -181,9 +178,10 @@ def _converted_pose(T: Float64[ndarray, "4 4"], convention: PoseConvention) -> F
     return out @ _OPENCV if convention.endswith("OpenCV axes") else out
 
 
-def _converted_coords(uv: Float64[ndarray, "n 2"], how: Interpretation, projector: Device) -> Float64[ndarray, "n 2"]:
+def converted_coords(uv: Float[ndarray, "n 2"], how: Interpretation, size: tuple[int, int]) -> Float[ndarray, "n 2"]:
+    """Coordinates in a pattern of `size` (w, h), with axes exchanged and mirrored."""
     x, y = uv.T[::-1] if how.swapped else uv.T
-    return np.stack([projector.w - x if how.mirrored_x else x, projector.h - y if how.mirrored_y else y], -1)
+    return np.stack([size[0] - x if how.mirrored_x else x, size[1] - y if how.mirrored_y else y], -1)
 
 
 def _stack(arrays: Iterator[Float64[ndarray, "..."]]) -> Tensor:
@@ -280,24 +278,6 @@ def hopeless(given: GeometricFit, bad: int, count: int) -> Problem:
     )
 
 
-def wrong_unit(metres: float) -> Problem:
-    """A working distance that is impossible for a scanner."""
-    return Problem(
-        f"would put the object {metres:.3g} m from the camera",
-        "lengths are in another unit than stated (m and mm mixed up?)",
-        'state the unit that the poses are in, or "arbitrary" if it is unknown',
-    )
-
-
-def far_away(times: float) -> Problem:
-    """A device that is `times` as far from the others as they usually are."""
-    return Problem(
-        f"puts the device {times:.2g} times as far from the other devices as is usual in this scan",
-        "registration failed for this frame, or its position is in another unit",
-        "register it again, or leave the frame out",
-    )
-
-
 # Epipolar residuals as fractions of the projector's focal length: angles in radians.
 _SUSPECT = 0.01  # 0.6 degrees: worse than auto-calibration usually is
 _SUSPECT_FRAME = 0.05  # of one frame among good ones
@@ -338,9 +318,25 @@ def convention_problems(
                 yield frame.name, key_of(own), describe(own, given, index)
     for index, key, times in _far_devices(frames):
         if index not in explained:
-            yield frames[index].name, key, far_away(times)
+            yield (
+                frames[index].name,
+                key,
+                Problem(
+                    f"puts the device {times:.2g} times as far from the other devices as is usual in this scan",
+                    "registration failed for this frame, or its position is in another unit",
+                    "register it again, or leave the frame out",
+                ),
+            )
     if metres is not None and not _NEAREST <= given.depth * metres <= _FARTHEST:
-        yield None, "units", wrong_unit(given.depth * metres)
+        yield (
+            None,
+            "units",
+            Problem(
+                f"would put the object {given.depth * metres:.3g} m from the camera",
+                "lengths are in another unit than stated (m and mm mixed up?)",
+                'state the unit that the poses are in, or "arbitrary" if it is unknown',
+            ),
+        )
 
 
 def _better_interpretation(

@@ -1,4 +1,4 @@
-"""Frames whose coordinates are not those of their image: shifted, of another frame, or of no image at all."""
+"""Do coordinates belong to the pattern and to the image? Shifted ones, those of another frame, or of no image."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -9,13 +9,12 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from scipy.ndimage import uniform_filter
 
-from sl_nerfstudio.scan.check_conventions import Interpretation, describe_coords
+from sl_nerfstudio.scan.check_conventions import Interpretation, converted_coords, describe_coords
 from sl_nerfstudio.scan.document import Problem
 
 # Are coordinates shifted relative to the pattern, for example because pixels are counted from their centres?
 #
-# The pattern, looked up at the coordinates, must resemble the captured pattern. The shift that makes the two most
-# alike
+# The pattern, looked up at the coordinates, must resemble the captured pattern. The shift that makes the two most alike
 # is estimated from the correlation at five places. Poses are not used.
 
 _STEP = 1.0  # px
@@ -92,8 +91,7 @@ def look_up(pattern: Float32[ndarray, "rows columns"], uv: Float32[ndarray, "n 2
 
 # Does a frame show the pattern where its coordinates say? Poses are not used.
 #
-# The pattern, looked up at the coordinates, must resemble the captured image. If it resembles it better after a
-# move by
+# The pattern, looked up at the coordinates, must resemble the captured image. If it resembles it better after a move by
 # whole pixels, the coordinates are shifted; if it never does, they are of another image, or of none.
 
 _FEWEST_COMPARED = 200
@@ -118,7 +116,7 @@ class ImagePrediction:
     def correlation(
         self, shown: Float32[ndarray, "h w"], allowed: Bool[ndarray, "h w"], x: int = 0, y: int = 0
     ) -> float:
-        """With an image, moved by (x, y) pixels, where `allowed` is True; 0 where too little is left."""
+        """Correlation with an image, moved by (x, y) pixels, where `allowed` is True; 0 where too little is left."""
         rows, columns = self.rows + y, self.columns + x
         inside = (rows >= 0) & (rows < shown.shape[0]) & (columns >= 0) & (columns < shown.shape[1])
         inside[inside] = allowed[rows[inside], columns[inside]]
@@ -129,7 +127,7 @@ class ImagePrediction:
         return float(np.nan_to_num(found))
 
     def thinned(self, count: int) -> "ImagePrediction":
-        """At about `count` of the pixels, without the memory of the others."""
+        """Copy about `count` of the pixels, without the memory of the others."""
         step = max(1, len(self.rows) // count)
         return ImagePrediction(self.rows[::step].copy(), self.columns[::step].copy(), self.values[::step].copy())
 
@@ -176,7 +174,7 @@ def match_image(
     size = (pattern.shape[1], pattern.shape[0])
     uv = coords[rows, columns]
     found = [
-        ImagePrediction(rows, columns, look_up(pattern, _interpreted(uv, how, size))).correlation(shown, allowed)
+        ImagePrediction(rows, columns, look_up(pattern, converted_coords(uv, how, size))).correlation(shown, allowed)
         for how in _OTHER_AXES
     ]
     return ImageMatch(
@@ -188,11 +186,6 @@ def match_image(
         interpreted=max(found),
         prediction=prediction.thinned(_KEPT),
     )
-
-
-def _interpreted(uv: Float32[ndarray, "n 2"], how: Interpretation, size: tuple[int, int]) -> Float32[ndarray, "n 2"]:
-    x, y = uv.T[::-1] if how.swapped else uv.T
-    return np.stack([size[0] - x if how.mirrored_x else x, size[1] - y if how.mirrored_y else y], -1)
 
 
 def _best_move(
@@ -269,7 +262,7 @@ def _is_shifted(match: ImageMatch, usual: float) -> bool:
 def _fitting_others(
     strange: dict[str, ImageMatch], names: Sequence[str], read_shown: Callable[[str], Shown | None]
 ) -> dict[str, tuple[str, float]]:
-    """For each frame, another one whose image its coordinates fit, with the correlation; each image is read once."""
+    """Find for each frame another one whose image its coordinates fit, with the correlation; read each image once."""
     found: dict[str, tuple[str, float]] = {}
     for other in names if strange else ():
         shown = read_shown(other)

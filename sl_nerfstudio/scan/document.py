@@ -1,11 +1,11 @@
-"""transforms.json as text: strict JSON, UTF-8, every key once, every number finite."""
+"""Files, problems and transforms.json: opening them, collecting what is wrong, reading keys of the right type."""
 
 import json
 import math
 import os
 import stat
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path, PureWindowsPath
@@ -114,6 +114,8 @@ class Faults:
             self.found.append(fault)
 
 
+# transforms.json as text: strict JSON, UTF-8, every key once, every number finite.
+
 TRANSFORMS = "transforms.json"
 MAX_BYTES = 256 << 20
 MAX_DEPTH = 32  # of lists and objects in each other; a scan has 6, and what walks a document may recurse this far
@@ -194,12 +196,9 @@ def _deeper_than(document: Any, limit: int) -> bool:
     """Whether lists and objects are nested more than `limit` times; level by level, without recursion."""
     level = [document]
     for _ in range(limit):
-        level = [item for outer in level if isinstance(outer, dict | list) for item in _inside(outer)]
+        nested = [outer for outer in level if isinstance(outer, dict | list)]
+        level = [item for outer in nested for item in (outer.values() if isinstance(outer, dict) else outer)]
     return any(isinstance(item, dict | list) for item in level)
-
-
-def _inside(outer: dict[str, Any] | list[Any]) -> Iterable[Any]:
-    return outer.values() if isinstance(outer, dict) else outer
 
 
 def _syntax_error(path: Path, content: bytes, error: json.JSONDecodeError) -> FileError:
@@ -434,13 +433,15 @@ def resolve_inside(root: Path, text: str) -> Path | Problem:
     The returned path keeps links inside the folder as they are; it is not resolved.
     """
     windows = PureWindowsPath(text)
-    if "\0" in text or _not_encodable(text):
+    try:
+        encodable = b"\0" not in os.fsencode(text)
+    except UnicodeEncodeError:
+        encodable = False
+    if not encodable:
         return Problem("contains characters that no file name can have", "the text is damaged", "correct the path")
     if text.startswith("/") or windows.drive:
         return Problem(
-            f"is absolute ({text})",
-            "it is valid on one machine only",
-            "give the path relative to the scan folder",
+            f"is absolute ({text})", "it is valid on one machine only", "give the path relative to the scan folder"
         )
     if ".." in windows.parts:
         return Problem(
@@ -468,11 +469,3 @@ def resolve_inside(root: Path, text: str) -> Path | Problem:
             "copy the files into the folder",
         )
     return path
-
-
-def _not_encodable(text: str) -> bool:
-    try:
-        os.fsencode(text)
-    except UnicodeEncodeError:
-        return True
-    return False

@@ -1,4 +1,4 @@
-"""Image files of a scan: grey or RGB, 8 or 16 bit, read exactly as stored or not at all."""
+"""Image and coordinate files: those of a scan, read exactly as stored or not at all, and photographs."""
 
 import math
 import struct
@@ -24,6 +24,8 @@ from PIL.PngImagePlugin import PngImageFile
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.scan.document import FileError, check_file, read_bytes, unreadable
 
+# Images of a scan: grey or RGB, 8 or 16 bit.
+
 FORMATS = ("PNG", "TIFF", "JPEG", "BMP")
 _LUMA = (0.299, 0.587, 0.114)  # Rec. 601
 _EXIF_ORIENTATION = 0x0112
@@ -37,18 +39,8 @@ _OTHER_KINDS = {
     "PA": "transparency",
     "1": "one bit per pixel",
 }
-_DAMAGE = (
-    OSError,
-    SyntaxError,
-    ValueError,
-    EOFError,
-    TypeError,
-    KeyError,
-    IndexError,
-    OverflowError,
-    struct.error,
-    zlib.error,
-)
+_DAMAGE = (OSError, SyntaxError, ValueError, EOFError, TypeError, LookupError, OverflowError, struct.error, zlib.error)
+"""What reading a damaged image may raise."""
 
 
 @dataclass(frozen=True)
@@ -161,10 +153,7 @@ def _header(path: Path, image: ImageFile) -> ImageHeader:
     """Size and kind; FileError for every kind that a scan must not hold."""
     if getattr(image, "n_frames", 1) != 1:
         raise FileError(
-            path,
-            "holds several images",
-            "it is an animation or a multi-page TIFF",
-            "write each image to its own file",
+            path, "holds several images", "it is an animation or a multi-page TIFF", "write each image to its own file"
         )
     raw = str(image.tile[0][3]) if image.tile else ""
     transparent = "transparency" in image.info
@@ -240,7 +229,7 @@ def _decode_deep_colour(path: Path, content: bytes) -> UInt16[ndarray, "h w 3"]:
 
 # Photographs as cameras and phones write them: turned as their EXIF tag says, HEIC too; raw files are refused.
 #
-# A scan folder itself holds only images that need no turning (`images.py`).
+# A scan folder itself holds only images that need no turning.
 
 PHONE = (".heic", ".heif")
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", *PHONE)
@@ -405,17 +394,7 @@ def _is_number(value: object) -> bool:
 KEY = "coords"
 _MAX_MEMBERS = 64
 _EXPORT_AGAIN = "write it with numpy.savez_compressed(file, coords=array) from a float32 array of shape (H, W, 2)"
-ARRAY_DAMAGE = (
-    OSError,
-    ValueError,
-    EOFError,
-    RuntimeError,
-    NotImplementedError,
-    KeyError,
-    SyntaxError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
+ARRAY_DAMAGE = (OSError, ValueError, EOFError, RuntimeError, KeyError, SyntaxError, zipfile.BadZipFile, zlib.error)
 """What reading a damaged .npy or .npz may raise."""
 
 
@@ -464,10 +443,7 @@ def _open_member(path: Path) -> Iterator[tuple[BufferedIOBase, int]]:
         raise
     except ARRAY_DAMAGE as error:
         raise FileError(
-            path,
-            f"cannot be read ({error})",
-            "the file is truncated, damaged or not what its name says",
-            _EXPORT_AGAIN,
+            path, f"cannot be read ({error})", "the file is truncated, damaged or not what its name says", _EXPORT_AGAIN
         ) from error
 
 

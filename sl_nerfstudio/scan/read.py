@@ -60,7 +60,13 @@ def pose_problem(T: Float64[ndarray, "..."]) -> Problem | None:
         )
     if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9:
         return _last_row_problem(T)
-    return _rotation_problem(T[:3, :3]) or _position_problem(T[:3, 3])
+    reach = float(np.abs(T[:3, 3]).max())
+    far = Problem(
+        f"puts the device {reach:.2g} units from the origin",
+        "registration or calibration diverged for this frame, or the number was damaged",
+        "calibrate it again or leave the frame out",
+    )
+    return _rotation_problem(T[:3, :3]) or (far if reach > FARTHEST else None)
 
 
 def _last_row_problem(T: Float64[ndarray, "4 4"]) -> Problem:
@@ -75,17 +81,6 @@ def _last_row_problem(T: Float64[ndarray, "4 4"]) -> Problem:
         f"has the last row {row} instead of 0, 0, 0, 1",
         "the matrix is projective or scaled, or its rows are in another order",
         "give a rigid motion from device to world",
-    )
-
-
-def _position_problem(position: Float64[ndarray, "3"]) -> Problem | None:
-    reach = float(np.abs(position).max())
-    if reach <= FARTHEST:
-        return None
-    return Problem(
-        f"puts the device {reach:.2g} units from the origin",
-        "registration or calibration diverged for this frame, or the number was damaged",
-        "calibrate it again or leave the frame out",
     )
 
 
@@ -308,9 +303,17 @@ def read_partial_scan(root: Path, faults: Faults, need_coords: bool = True) -> P
     document_faults(document, TRANSFORMS, faults)
     top = Fields(document, faults, TRANSFORMS)
     top.check_spelling(_TOP_KEYS)
-    _check_format(top)
+    number = top.read_number("sl_format")
+    if number is not None and number != FORMAT:
+        top.fault(
+            "sl_format", f"is {number:g}", "it was written by a newer version of this package", "update the package"
+        )
     partial.units = top.read_choice("units", list(UNITS), "an unknown unit of length")
-    _read_projector(top, partial)
+    section = top.read_section("projector")
+    if section is not None:
+        section.check_spelling(PROJECTOR_KEYS)
+        partial.projector = read_device(section, "projector")
+        partial.pattern_path = read_path(section, "pattern_path", root)
     common_sigma = read_sigma(top)
     records = _frame_records(top)
     common = _read_common_camera(top, records)
@@ -332,12 +335,12 @@ def read_partial_scan(root: Path, faults: Faults, need_coords: bool = True) -> P
 def _without_projector(document: dict[str, Any]) -> bool:
     """Whether the file is one of nerfstudio's that was never meant to be a scan: not even a key of this format."""
     frames = document.get("frames")
-    ours = {"sl_format", "projector"} & set(document)
-    return isinstance(frames, list) and bool(frames) and not ours and not any(map(_has_projector_keys, frames))
-
-
-def _has_projector_keys(record: Any) -> bool:
-    return not isinstance(record, dict) or any(key.startswith(("sl_", "projector")) for key in record)
+    if not isinstance(frames, list) or not frames or {"sl_format", "projector"} & set(document):
+        return False
+    return all(
+        isinstance(record, dict) and not any(key.startswith(("sl_", "projector")) for key in record)
+        for record in frames
+    )
 
 
 def _transforms_path(root: Path) -> Path:
@@ -347,23 +350,6 @@ def _transforms_path(root: Path) -> Path:
             root, f"is missing: {root} {what}", "the path is mistyped", "give the folder that holds transforms.json"
         )
     return root / TRANSFORMS
-
-
-def _check_format(top: Fields) -> None:
-    number = top.read_number("sl_format")
-    if number is not None and number != FORMAT:
-        top.fault(
-            "sl_format", f"is {number:g}", "it was written by a newer version of this package", "update the package"
-        )
-
-
-def _read_projector(top: Fields, partial: PartialScan) -> None:
-    section = top.read_section("projector")
-    if section is None:
-        return
-    section.check_spelling(PROJECTOR_KEYS)
-    partial.projector = read_device(section, "projector")
-    partial.pattern_path = read_path(section, "pattern_path", partial.root)
 
 
 def _frame_records(top: Fields) -> list[Any]:
@@ -416,7 +402,7 @@ def relative(path: Path, root: Path) -> str:
 
 
 def _check_frame(frame: PartialFrame, root: Path, good: set[Path], faults: Faults) -> None:
-    size = _size(frame.camera)
+    size = None if frame.camera is None else (frame.camera.w, frame.camera.h)
     for key in ("file_path", "sl_pattern_path", "mask_path", "sl_color_path"):
         if key in frame.paths:
             _check_image(
@@ -463,10 +449,6 @@ def _check_image(
         )
     if len(faults.found) == before:
         good.add(path)
-
-
-def _size(device: Device | None) -> tuple[int, int] | None:
-    return None if device is None else (device.w, device.h)
 
 
 def _wrong_size(found: tuple[int, int], wanted: tuple[int, int], device: str) -> Problem:

@@ -27,10 +27,7 @@ PROJECTOR_KEYS = ("model", *REQUIRED, *DISTORTION, "pattern_path")
 _UNSUPPORTED = ("k3", "k4", "k5", "k6")
 _NARROWEST, _WIDEST = 100.0, 0.1  # focal length in widths of the image: fields of view of 0.57 and 157 degrees
 _ROUND_TRIP_PX = 1e-3
-_LEAST_STRETCH, _MOST_STRETCH = (
-    0.2,
-    2.0,
-)  # of distances from the principal point: fisheye lenses shrink them, none doubles
+_LEAST_STRETCH, _MOST_STRETCH = 0.2, 2.0  # of distances from the principal point: fisheyes shrink, none doubles them
 
 
 def read_device(fields: Fields, kind: str) -> Device | None:
@@ -132,7 +129,8 @@ def _distortion_problems(device: Device) -> Iterator[tuple[str, Problem]]:
     straight = directions[..., :2] / -directions[..., 2:]
     bent = (uv - uv.new_tensor([device.cx, device.cy])) / uv.new_tensor([device.fl_x, device.fl_y])
     stretch = (bent.norm(dim=-1) / straight.norm(dim=-1)).nan_to_num(1.0)
-    extreme = [value for value in (float(stretch.min()), float(stretch.max())) if not _plausible(value)]
+    ends = float(stretch.min()), float(stretch.max())
+    extreme = [value for value in ends if not _LEAST_STRETCH <= value <= _MOST_STRETCH]
     if extreme:
         yield (
             "k1",
@@ -144,9 +142,7 @@ def _distortion_problems(device: Device) -> Iterator[tuple[str, Problem]]:
         )
 
 
-def _plausible(stretch: float) -> bool:
-    return _LEAST_STRETCH <= stretch <= _MOST_STRETCH
-
+# The scan.
 
 FORMAT = 1  # of the scan folder
 
@@ -405,7 +401,7 @@ def _last_number(name: str) -> int | None:
 
 
 def _read_bar(section: Fields) -> ScaleBar | None:
-    """None where the scan has no scale bar, or after adding a fault."""
+    """Read the scale bar; None where the scan has none, or after adding a fault."""
     ends, length = section.record.get("distance_between"), section.record.get("length")
     if ends is None and length is None:
         return None
@@ -472,18 +468,14 @@ def _surface_point(scan: Scan, end: PickedPixel, poses: DevicePoses) -> Float64[
     depth = points.depth_camera.numpy()
     depth = depth[np.isfinite(depth)]
     if not len(depth):
-        raise ScanError([_nothing_near(end)], str(scan.root))
+        nothing = Fault(
+            TRANSFORMS,
+            end.frame,
+            "scale.distance_between",
+            f"has no decoded coordinates within {NEAR_PX:g} pixels of ({end.pixel[0]:g}, {end.pixel[1]:g})",
+            "the pattern was not decoded there",
+            "pick a pixel on the object where coordinates were decoded",
+        )
+        raise ScanError([nothing], str(scan.root))
     origin, direction = pixel_rays(camera, T_camera, torch.tensor([end.pixel], dtype=torch.float64))
     return (origin + float(np.median(depth)) * direction)[0].numpy()
-
-
-def _nothing_near(end: PickedPixel) -> Fault:
-    x, y = end.pixel
-    return Fault(
-        TRANSFORMS,
-        end.frame,
-        "scale.distance_between",
-        f"has no decoded coordinates within {NEAR_PX:g} pixels of ({x:g}, {y:g})",
-        "the pattern was not decoded there",
-        "pick a pixel on the object where coordinates were decoded",
-    )

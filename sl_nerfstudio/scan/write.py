@@ -1,4 +1,4 @@
-"""Other poses and devices for the frames of a scan: true ones read, refined ones written, as a transforms.json."""
+"""Writing a scan folder; and other poses and devices for its frames, in a transforms.json beside it."""
 
 import json
 from collections.abc import Sequence
@@ -233,9 +233,10 @@ def encode_json(document: dict[str, Any]) -> bytes:
     return (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
+# Poses and devices in another transforms.json: true ones read, refined ones written.
+
 GROUND_TRUTH = "ground_truth"
 _FOCAL_AND_CENTRE = ("fl_x", "fl_y", "cx", "cy")
-_Poses = Float64[ndarray, "n 4 4"]
 
 
 def write_transforms(
@@ -260,7 +261,8 @@ def write_transforms(
     document = _read(scan.root / TRANSFORMS, str(scan.root))
     names = [frame_label(record, index) for index, record in enumerate(document["frames"])]
     if names != [frame.name for frame in scan.frames]:
-        raise ScanError([_changed()], str(scan.root))
+        changed = "lists other frames than before", "it was changed after it was read", "start again"
+        raise ScanError([Fault(TRANSFORMS, None, "frames", *changed)], str(scan.root))
     document.pop("sl_pose_sigma", None)
     for index, record in enumerate(document["frames"]):
         record.pop("sl_pose_sigma", None)
@@ -390,7 +392,8 @@ def _read_both_kinds(
                 found[key].append(read_pose(fields, key))
     if faults.found:
         raise ScanError(faults.found, str(path.parent))
-    return _stack(found[POSES[0]]), _stack(found[POSES[1]])
+    cameras, projectors = ([T for T in found[key] if T is not None] for key in POSES)
+    return np.stack(cameras) if cameras else None, np.stack(projectors) if projectors else None
 
 
 def _read(path: Path, where: str) -> Record:
@@ -408,14 +411,3 @@ def _read(path: Path, where: str) -> Record:
         faults.add(problem, path.name, None, "frames")
         raise ScanError(faults.found, where)
     return document
-
-
-def _changed() -> Fault:
-    return Fault(
-        TRANSFORMS, None, "frames", "lists other frames than before", "it was changed after it was read", "start again"
-    )
-
-
-def _stack(poses: list[Float64[ndarray, "4 4"] | None]) -> _Poses | None:
-    present = [T for T in poses if T is not None]
-    return np.stack(present) if present else None

@@ -1,4 +1,4 @@
-"""Optical properties of the object, the room, the projector's lamp and the lens."""
+"""How captures look: material, light, projector and lens of photographs, and the plain surface of grey images."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,52 +22,33 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Ranges:
-    """Each property is drawn between two values, once for a scan or once for each frame.
+    """Each property is drawn between two values, once for a scan or once for each frame; the defaults are `realistic`.
 
     Blur of the camera is in pixels of an image 600 pixels wide, and grows with its width.
     """
 
     # of a scan
-    pattern_blur: Range  # sigma of the projected pattern in focus, pattern pixels
-    pattern_defocus: Range  # sigma added in quadrature half the object's size off the focal plane, pattern pixels
-    camera_blur: Range  # sigma in focus, pixels
-    camera_defocus: Range  # sigma added in quadrature half the object's size off the focal plane, pixels
-    brightness: Range  # of the object's material, share of light reflected
-    texture_contrast: Range  # share of light that a layer of texture takes away at most
-    texture_layers: tuple[int, int]  # number on the object, least and most
-    gloss: Range  # strength of the highlight
-    gloss_exponent: Range
-    room_light: Range  # all of it, for a white surface, where the lamp of the projector has 1
-    gamma: Range
-    noise: Range  # times --sensor-noise
-    useless: float  # share of the frames
+    pattern_blur: Range = (0.5, 0.9)  # sigma of the projected pattern in focus, pattern pixels
+    pattern_defocus: Range = (1.0, 2.2)  # added in quadrature half the object's size off the focal plane, the same
+    camera_blur: Range = (0.5, 0.9)  # sigma in focus, pixels
+    camera_defocus: Range = (0.3, 1.1)  # added in quadrature half the object's size off the focal plane, the same
+    brightness: Range = (0.45, 0.85)  # of the object's material, share of light reflected
+    texture_contrast: Range = (0.2, 0.55)  # share of light that a layer of texture takes away at most
+    texture_layers: tuple[int, int] = (1, 2)  # number on the object, least and most
+    gloss: Range = (0.02, 0.2)  # strength of the highlight
+    gloss_exponent: Range = (8.0, 60.0)
+    room_light: Range = (0.06, 0.28)  # all of it, for a white surface, where the lamp of the projector has 1
+    gamma: Range = (1.8, 2.4)
+    noise: Range = (0.8, 1.8)  # times --sensor-noise
+    useless: float = 0.04  # share of the frames
     # of a frame
-    exposure: Range  # times the one that suits the material
-    motion: Range  # length of the path of a point in the image while the shutter is open, pixels
-    jpeg_quality: Range
-    shake: Range  # the same as `motion`, in frames spoiled by it
+    exposure: Range = (0.7, 1.4)  # times the one that suits the material
+    motion: Range = (0.0, 2.2)  # length of the path of a point in the image while the shutter is open, pixels
+    jpeg_quality: Range = (78.0, 95.0)
+    shake: Range = (14.0, 30.0)  # the same as `motion`, in frames spoiled by it
 
 
-REALISTIC = Ranges(
-    pattern_blur=(0.5, 0.9),
-    pattern_defocus=(1.0, 2.2),
-    camera_blur=(0.5, 0.9),
-    camera_defocus=(0.3, 1.1),
-    brightness=(0.45, 0.85),
-    texture_contrast=(0.2, 0.55),
-    texture_layers=(1, 2),
-    gloss=(0.02, 0.2),
-    gloss_exponent=(8.0, 60.0),
-    room_light=(0.06, 0.28),
-    gamma=(1.8, 2.4),
-    noise=(0.8, 1.8),
-    useless=0.04,
-    exposure=(0.7, 1.4),
-    motion=(0.0, 2.2),
-    jpeg_quality=(78.0, 95.0),
-    shake=(14.0, 30.0),
-)
-
+REALISTIC = Ranges()
 HARD = Ranges(
     pattern_blur=(0.6, 1.1),
     pattern_defocus=(1.3, 2.3),
@@ -103,8 +84,7 @@ def draw_log(rng: np.random.Generator, bounds: Range) -> float:
 
 # Solid textures: where a surface is darker, as a function of the point in space, so that all frames agree.
 #
-# Each function draws one texture for an object of a given size and returns a map from points (relative to the
-# object's
+# Each function draws one texture for an object of a given size and returns a map from points (relative to the object's
 # middle, in its unit) to values from 0 (untouched) to 1 (fully coloured).
 
 Texture = Callable[[Float32[ndarray, "n 3"]], Float32[ndarray, "n"]]
@@ -290,18 +270,15 @@ def make_material(
         texture = TEXTURES[str(name)](size, rng)
         taken = draw(rng, ranges.texture_contrast) * rng.uniform(0.7, 1.0, 3)
         layers.append(Layer(texture, (1 - taken).astype(np.float32)))
+    brightness = draw(rng, ranges.brightness)
+    base = tint(0.25, rng) * np.float32(brightness)
     return Material(
         centre,
-        _tinted(draw(rng, ranges.brightness), 0.25, rng),
+        base,
         tuple(layers),
         draw(rng, ranges.gloss),
         draw_log(rng, ranges.gloss_exponent),
     )
-
-
-def _tinted(brightness: float, strength: float, rng: np.random.Generator) -> Float32[ndarray, "3"]:
-    """A colour of the given luma."""
-    return tint(strength, rng) * np.float32(brightness)
 
 
 def tint(strength: float, rng: np.random.Generator) -> Float32[ndarray, "3"]:
@@ -407,7 +384,7 @@ def make_pattern(
 
 
 def make_lamp(distance: float, rng: np.random.Generator) -> Lamp:
-    """White, warm, cold or tinted."""
+    """Draw a lamp: white, warm, cold or tinted."""
     return Lamp(tint(rng.choice([0.08, 0.3]), rng), rng.uniform(0.02, 0.08), rng.uniform(0.2, 0.5), distance)
 
 
@@ -526,6 +503,8 @@ def make_look(
         draw(of_sensor, ranges.gamma),
     )
 
+
+# Plain images: one grey matte surface.
 
 _ALBEDO_WAVES = 14
 

@@ -1,4 +1,4 @@
-"""The folder that `sl-synth --scene chessboard` writes."""
+"""Photographs of a calibration board under a pattern, with their truth: `sl-synth --scene chessboard`."""
 
 import json
 from collections.abc import Iterator, Sequence

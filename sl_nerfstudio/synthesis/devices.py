@@ -1,4 +1,4 @@
-"""Intrinsics that fit a scene: the object fills the image, and the pattern covers the object."""
+"""Devices that fit a scene, their paths around it, and the errors of poses, coordinates and images."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -9,13 +9,15 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter
 
-from sl_nerfstudio.geometry.devices import Device, DeviceKind, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.lie import DevicePoses, exp_so3, fit_similarity, log_so3
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan.types import PoseSigma
+from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.sdf import Scene
 
-Distortion = tuple[float, float, float, float]
+# Intrinsics: the object fills the image, and the pattern covers the object.
+
 _CAMERA_FILL = 0.92  # of half the image, reached by the object in the frame where it extends farthest
 _PATTERN_FILL = 0.88
 
@@ -28,22 +30,12 @@ class DevicePair:
     projector: Device
 
 
-@dataclass(frozen=True)
-class DeviceOptions:
-    """The options for both devices."""
-
-    resolution: int = 400
-    projector_model: DeviceKind = "OPENCV"
-    camera_distortion: Distortion = (0.0, 0.0, 0.0, 0.0)
-    projector_distortion: Distortion = (0.0, 0.0, 0.0, 0.0)
-
-
-def make_devices(scene: Scene, poses: DevicePoses, pattern_size: tuple[int, int], options: DeviceOptions) -> DevicePair:
+def make_devices(scene: Scene, poses: DevicePoses, pattern_size: tuple[int, int], config: SynthConfig) -> DevicePair:
     """A square camera and a projector of the pattern's (w, h), zoomed so that the whole object is in every frame."""
-    n, (w, h) = options.resolution, pattern_size
+    n, (w, h) = config.resolution, pattern_size
     # principal points slightly off the middle, as in real devices
-    camera = Device(n, n, 1.0, 1.0, 0.503 * n, 0.496 * n, *options.camera_distortion)
-    projector = Device(w, h, 1.0, 1.0, 0.498 * w, 0.505 * h, *options.projector_distortion, options.projector_model)
+    camera = Device(n, n, 1.0, 1.0, 0.503 * n, 0.496 * n, *config.camera_distortion)
+    projector = Device(w, h, 1.0, 1.0, 0.498 * w, 0.505 * h, *config.projector_distortion, config.projector_model)
     return DevicePair(
         _zoomed(camera, scene, poses.T_world_camera, _CAMERA_FILL),
         _zoomed(projector, scene, poses.T_world_projector, _PATTERN_FILL),
@@ -218,13 +210,10 @@ def _about_a_projector(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Gene
 
 # Errors of the starting poses, like those of auto-calibration and registration; nothing here renders.
 #
-# Auto-calibration has errors in the pose of a projector relative to its camera: rotation, direction and length of
-# the
-# baseline. The frame's triangulated points are then slightly deformed and have a wrong size, and registration
-# aligns
-# *them* with the others: a baseline 2 % too long moves camera and projector about 2 % away from the object. The
-# error of
-# registration itself moves a frame as a whole and rotates it about the object.
+# Auto-calibration has errors in the pose of a projector relative to its camera: rotation, direction and length of the
+# baseline. The frame's triangulated points are then slightly deformed and have a wrong size, and registration aligns
+# *them* with the others: a baseline 2 % too long moves camera and projector about 2 % away from the object. The error
+# of registration itself moves a frame as a whole and rotates it about the object.
 
 _FEWEST_POINTS = 20  # with fewer, a frame is not registered again
 

@@ -5,22 +5,28 @@ from typing import Literal
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 from scipy.ndimage import map_coordinates
 
 from sl_nerfstudio.geometry.lie import DevicePoses, exp_so3
 from sl_nerfstudio.synthesis.appearance import Look, Ranges, draw, draw_log, moved
-from sl_nerfstudio.synthesis.devices import DevicePair, rays
-from sl_nerfstudio.synthesis.render import RayCaster, VisiblePoints, sample_view, shading_normals, visible_centres
+from sl_nerfstudio.synthesis.devices import rays
+from sl_nerfstudio.synthesis.render import (
+    FrameGeometry,
+    RayCaster,
+    VisiblePoints,
+    sample_view,
+    shading_normals,
+    visible_centres,
+)
 
 # One bounce: light of the projector that one surface throws onto another.
 #
 # The pattern's light is cast in a coarse bundle of rays; each point that it meets shines on like a small matte lamp
-# (Keller's virtual point lights, 1997). What they send to a surface is gathered at a coarse grid of image pixels,
-# with
-# shadow rays, as a vector of light for each colour, so that fine relief is still shaded by its own normals. The
-# pattern
+# (Keller's virtual point lights, 1997). What they send to a surface is gathered at a coarse grid of image pixels, with
+# shadow rays, as a vector of light for each colour, so that fine relief is still shaded by its own normals. The pattern
 # itself is too fine to survive the bounce, so its mean is used.
 
 _FACING = 1e-3  # cosines below this carry no light
@@ -161,8 +167,6 @@ def _shot(ranges: Ranges, rng: np.random.Generator, useless: bool) -> Shot:
 
 def _turn(rng: np.random.Generator) -> Float64[ndarray, "4 4"]:
     """A rotation of a device about a random axis across its line of sight."""
-    import torch
-
     angle, axis = np.radians(draw(rng, _AWAY_DEG)), rng.uniform(0, 2 * np.pi)
     T = np.eye(4)
     w: Float[ndarray, 3] = angle * np.array([np.cos(axis), np.sin(axis), 0.0])
@@ -188,35 +192,23 @@ class Photograph:
     jpeg: bytes
 
 
-@dataclass(frozen=True)
-class FrameGeometry:
-    """What stands where in one frame."""
-
-    caster: RayCaster
-    devices: DevicePair
-    T_world_camera: Float[ndarray, "4 4"]
-    T_world_projector: Float[ndarray, "4 4"]
-
-
 def take_photograph(
     stage: FrameGeometry, look: Look, shot: Shot, supersampling: int, rng: np.random.Generator
 ) -> Photograph:
     """Render a frame and develop it; `rng` is for the sensor's noise."""
-    at = stage.caster, stage.devices, stage.T_world_camera, stage.T_world_projector
-    centres = visible_centres(*at)
+    centres = visible_centres(stage)
     bounced = _bounced_vectors(stage, look, centres)
 
     def light(seen: VisiblePoints, pixel: Int64[ndarray, "n"]) -> Float32[ndarray, "n 3"]:
         return _reflected(stage, look, seen, bounced[pixel])
 
-    view = sample_view(*at, centres, light, look.room.nothing, supersampling)
+    view = sample_view(stage, centres, light, look.room.nothing, supersampling)
     depth = -(centres.p_world - stage.T_world_camera[:3, 3]) @ stage.T_world_camera[:3, 2]
-    image = look.lens.blurred(view.radiance, depth.reshape(view.shape))
+    image = look.lens.blurred(view.radiance, depth.reshape(view.mask.shape))
     image = moved(image, shot.motion * stage.devices.camera.w / _MOTION_WIDTH, shot.motion_direction)
     sensor = Sensor(look.gain * shot.exposure, look.noise, look.gamma, shot.jpeg_quality)
     jpeg = sensor.encode(sensor.develop(image, rng))
-    on_object = stage.caster.on_object(centres.face).reshape(view.shape)
-    return Photograph(view.coords, view.mask, on_object, decode_jpeg(jpeg), jpeg)
+    return Photograph(view.coords, view.mask, view.object_mask, decode_jpeg(jpeg), jpeg)
 
 
 def _reflected(

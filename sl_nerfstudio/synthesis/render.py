@@ -1,4 +1,4 @@
-"""What a camera sees of a scene lit by a projector: exact correspondences, and the reflected light."""
+"""What a camera sees of a scene lit by a projector: surroundings, ray casting, correspondences, reflected light."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.pattern.grid import sample_bilinear
 from sl_nerfstudio.synthesis.appearance import Appearance
 from sl_nerfstudio.synthesis.devices import DevicePair, pixels, rays
@@ -176,6 +177,16 @@ class RayCaster:
 
 
 @dataclass(frozen=True)
+class FrameGeometry:
+    """What stands where in one frame."""
+
+    caster: RayCaster
+    devices: DevicePair
+    T_world_camera: Float[ndarray, "4 4"]
+    T_world_projector: Float[ndarray, "4 4"]
+
+
+@dataclass(frozen=True)
 class VisiblePoints:
     """The surface points at some camera pixels; points and pattern pixels are NaN where the object is not hit."""
 
@@ -193,92 +204,48 @@ class RenderedCapture:
     coords: Float32[ndarray, "h w 2"]  # exact at pixel centres; NaN outside the mask
     mask: Bool[ndarray, "h w"]
     object_mask: Bool[ndarray, "h w"]  # the object, lit or not, and not its surroundings
-    radiance: Float32[ndarray, "h w"]  # 1 is a white surface facing the projector, in its full light
-
-
-@dataclass(frozen=True)
-class SampledView:
-    """What rays through the pixels of a camera meet."""
-
-    at_centres: VisiblePoints  # (h * w) pixels, row by row
-    radiance: Float32[ndarray, "h w *c"]  # mean over each pixel
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width of the image."""
-        return self.radiance.shape[0], self.radiance.shape[1]
-
-    @property
-    def mask(self) -> Bool[ndarray, "h w"]:
-        """Pixels with coordinates."""
-        return self.at_centres.lit.reshape(self.shape)
-
-    @property
-    def coords(self) -> Float32[ndarray, "h w 2"]:
-        """Exact at pixel centres; NaN outside the mask."""
-        coords = np.full((self.at_centres.lit.size, 2), np.nan, dtype=np.float32)
-        coords[self.at_centres.lit] = self.at_centres.uv_projector[self.at_centres.lit]
-        return coords.reshape(*self.shape, 2)
+    radiance: Float32[ndarray, "h w *c"]  # mean over each pixel; 1: a white surface in the projector's full light
 
 
 Light = Callable[[VisiblePoints, Int64[ndarray, "n"]], Float32[ndarray, "n *c"]]
 """Light that the points seen through some pixels (numbered row by row) send to the camera."""
 
 
-def visible_points(
-    caster: RayCaster,
-    devices: DevicePair,
-    T_world_camera: Float[ndarray, "4 4"],
-    T_world_projector: Float[ndarray, "4 4"],
-    uv: Float[ndarray, "n 2"],
-) -> VisiblePoints:
+def visible_points(frame: FrameGeometry, uv: Float[ndarray, "n 2"]) -> VisiblePoints:
     """Cast rays through camera pixels `uv` onto the scene, and a shadow ray from the projector to every point found."""
-    hits = caster.first_hits(T_world_camera[:3, 3], rays(devices.camera, T_world_camera, uv))
+    caster, eye, lamp = frame.caster, frame.T_world_camera[:3, 3], frame.T_world_projector[:3, 3]
+    hits = caster.first_hits(eye, rays(frame.devices.camera, frame.T_world_camera, uv))
     hit = hits.face >= 0
     uv_projector = np.full(uv.shape, np.nan)
     lit = np.zeros(len(uv), dtype=bool)
     p, face = hits.p_world[hit], hits.face[hit]
-    uv_projector[hit], inside = pixels(devices.projector, T_world_projector, p)
+    uv_projector[hit], inside = pixels(frame.devices.projector, frame.T_world_projector, p)
     normal = caster.scene.face_normals[face]
-    same_side = ((T_world_camera[:3, 3] - p) * normal).sum(-1) * ((T_world_projector[:3, 3] - p) * normal).sum(-1) > 0
+    same_side = ((eye - p) * normal).sum(-1) * ((lamp - p) * normal).sum(-1) > 0
     reached = inside & same_side
-    reached[reached] = caster.sees(T_world_projector[:3, 3], p[reached], face[reached])
+    reached[reached] = caster.sees(lamp, p[reached], face[reached])
     lit[hit] = reached
     return VisiblePoints(hit, hits.face, hits.p_world, uv_projector, lit)
 
 
 def render_capture(
-    caster: RayCaster,
-    devices: DevicePair,
-    T_world_camera: Float[ndarray, "4 4"],
-    T_world_projector: Float[ndarray, "4 4"],
-    pattern: Float32[ndarray, "ph pw"],
-    appearance: Appearance,
-    supersampling: int = 2,
+    frame: FrameGeometry, pattern: Float32[ndarray, "ph pw"], appearance: Appearance, supersampling: int = 2
 ) -> RenderedCapture:
     """Render a frame: correspondences at pixel centres, light as the mean of `supersampling`^2 rays per pixel."""
 
     def light(seen: VisiblePoints, _: Int64[ndarray, "n"]) -> Float32[ndarray, "n"]:
-        return _light(seen, caster.scene, devices, T_world_projector, pattern, appearance)
+        return _light(seen, frame, pattern, appearance)
 
-    nothing = np.float32(appearance.background)
-    centres = visible_centres(caster, devices, T_world_camera, T_world_projector)
-    view = sample_view(caster, devices, T_world_camera, T_world_projector, centres, light, nothing, supersampling)
-    on_object = caster.on_object(centres.face).reshape(view.shape)
-    return RenderedCapture(view.coords, view.mask, on_object, appearance.through_lens(view.radiance))
+    centres = visible_centres(frame)
+    view = sample_view(frame, centres, light, np.float32(appearance.background), supersampling)
+    return replace(view, radiance=appearance.through_lens(view.radiance))
 
 
-def visible_centres(
-    caster: RayCaster,
-    devices: DevicePair,
-    T_world_camera: Float[ndarray, "4 4"],
-    T_world_projector: Float[ndarray, "4 4"],
-) -> VisiblePoints:
+def visible_centres(frame: FrameGeometry) -> VisiblePoints:
     """What the rays through all pixel centres meet, row by row."""
-    n = devices.camera.w * devices.camera.h
-    box = np.flatnonzero(_box_of_the_scene(caster.scene, devices, T_world_camera))
-    uv = _corners(devices)[box] + 0.5
-    found = visible_points(caster, devices, T_world_camera, T_world_projector, uv)
+    camera = frame.devices.camera
+    n, box = camera.w * camera.h, np.flatnonzero(_box_of_the_scene(frame))
+    found = visible_points(frame, _corners(camera)[box] + 0.5)
     hit, lit = np.zeros((2, n), dtype=bool)
     face, p_world, uv_projector = np.full(n, -1), np.full((n, 3), np.nan), np.full((n, 2), np.nan)
     hit[box], lit[box], face[box] = found.hit, found.lit, found.face
@@ -287,18 +254,15 @@ def visible_centres(
 
 
 def sample_view(
-    caster: RayCaster,
-    devices: DevicePair,
-    T_world_camera: Float[ndarray, "4 4"],
-    T_world_projector: Float[ndarray, "4 4"],
+    frame: FrameGeometry,
     centres: VisiblePoints,
     light: Light,
     nothing: Float32[ndarray, "*c"] | np.float32,
     supersampling: int,
-) -> SampledView:
+) -> RenderedCapture:
     """Light as the mean of `supersampling`^2 rays per pixel; `nothing` is what is seen where no surface is."""
-    w, h = devices.camera.w, devices.camera.h
-    corner = _corners(devices)
+    w, h = frame.devices.camera.w, frame.devices.camera.h
+    corner = _corners(frame.devices.camera)
     radiance = np.empty((h * w, *np.shape(nothing)), dtype=np.float32)
     radiance[:] = nothing
     near = np.flatnonzero(_near_a_hit(centres.hit.reshape(h, w)))
@@ -306,23 +270,29 @@ def sample_view(
     step = (np.arange(supersampling) + 0.5) / supersampling
     for dy in step:
         for dx in step:
-            seen = visible_points(caster, devices, T_world_camera, T_world_projector, corner[near] + (dx, dy))
-            total += light(seen, near)
+            total += light(visible_points(frame, corner[near] + (dx, dy)), near)
     radiance[near] = total / supersampling**2
-    return SampledView(centres, radiance.reshape(h, w, *np.shape(nothing)))
+    coords = np.full((h * w, 2), np.nan, dtype=np.float32)
+    coords[centres.lit] = centres.uv_projector[centres.lit]
+    on_object = frame.caster.on_object(centres.face)
+    return RenderedCapture(
+        coords.reshape(h, w, 2),
+        centres.lit.reshape(h, w),
+        on_object.reshape(h, w),
+        radiance.reshape(h, w, *np.shape(nothing)),
+    )
 
 
-def _corners(devices: DevicePair) -> Int64[ndarray, "n 2"]:
+def _corners(camera: Device) -> Int64[ndarray, "n 2"]:
     """Upper left corners (x, y) of all pixels, row by row."""
-    w, h = devices.camera.w, devices.camera.h
-    return np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2)
+    return np.stack(np.meshgrid(np.arange(camera.w), np.arange(camera.h)), -1).reshape(-1, 2)
 
 
-def _box_of_the_scene(scene: Scene, devices: DevicePair, T_world_camera: Float[ndarray, "4 4"]) -> Bool[ndarray, "h w"]:
+def _box_of_the_scene(frame: FrameGeometry) -> Bool[ndarray, "h w"]:
     """Pixels that may see a surface: a rectangle around its vertices, or all if some are behind the camera."""
-    camera = devices.camera
-    uv, _ = pixels(camera, T_world_camera, scene.vertices)
-    depth = -(scene.vertices - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
+    camera, T_world_camera, vertices = frame.devices.camera, frame.T_world_camera, frame.caster.scene.vertices
+    uv, _ = pixels(camera, T_world_camera, vertices)
+    depth = -(vertices - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
     box = np.zeros((camera.h, camera.w), dtype=bool)
     if depth.min() <= 0 or camera.k1 or camera.k2 or camera.p1 or camera.p2:
         return ~box  # behind the camera, or edges bent by distortion
@@ -339,24 +309,19 @@ def _near_a_hit(hit: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
 
 
 def _light(
-    seen: VisiblePoints,
-    scene: Scene,
-    devices: DevicePair,
-    T_world_projector: Float[ndarray, "4 4"],
-    pattern: Float32[ndarray, "ph pw"],
-    appearance: Appearance,
+    seen: VisiblePoints, frame: FrameGeometry, pattern: Float32[ndarray, "ph pw"], appearance: Appearance
 ) -> Float32[ndarray, "n"]:
     """Light reflected by a matte surface: from the projector (cosine and inverse-square law) and from the room."""
     out = np.full(len(seen.hit), appearance.background, dtype=np.float32)
     p = seen.p_world[seen.hit]
-    normal = shading_normals(scene, seen.face[seen.hit], p).astype(np.float32)
+    normal = shading_normals(frame.caster.scene, seen.face[seen.hit], p).astype(np.float32)
     light = appearance.ambient(normal)
     lit = seen.lit[seen.hit]
     uv = seen.uv_projector[seen.hit][lit]
-    to_projector = T_world_projector[:3, 3] - p[lit]
+    to_projector = frame.T_world_projector[:3, 3] - p[lit]
     distance2 = (to_projector**2).sum(-1)
     cosine = np.abs((to_projector * normal[lit]).sum(-1)) / np.sqrt(distance2)
-    strength = appearance.projector_fall_off(uv, devices.projector) * appearance.reference_distance**2 / distance2
+    strength = appearance.projector_fall_off(uv, frame.devices.projector) * appearance.reference_distance**2 / distance2
     light[lit] += (appearance.projected(sample_bilinear(pattern, uv)) * cosine * strength).astype(np.float32)
     out[seen.hit] = light * appearance.albedo(p)
     return out

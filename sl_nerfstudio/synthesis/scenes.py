@@ -1,4 +1,4 @@
-"""Scenes by name, and from mesh files."""
+"""Scenes: built-in objects by name, and mesh files."""
 
 import math
 from collections.abc import Callable
@@ -311,11 +311,7 @@ def head(cell: float = 1.25) -> Scene:
     brow = mirrored(capsule((9, 62, 122), (38, 49, 121), 7.5, 6.0))
     cheek = mirrored(ellipsoid((31, 48, 86), (15, 14, 14)))
     nose = union(6.0, capsule((0, 63, 118), (0, 81, 91), 5.5, 8.0), mirrored(ellipsoid((8.5, 71, 88), (6.5, 8.5, 6))))
-    lips = union(
-        1.5,
-        ellipsoid((0, 64, 69.5), (18, 7.5, 4.6)),
-        ellipsoid((0, 64.5, 62), (15, 7.5, 5.2)),
-    )
+    lips = union(1.5, ellipsoid((0, 64, 69.5), (18, 7.5, 4.6)), ellipsoid((0, 64.5, 62), (15, 7.5, 5.2)))
     body = union(9.0, union(16.0, skull, neck), brow, cheek, nose)
     body = union(3.0, body, lips)
     sockets = mirrored(ellipsoid((23, 66, 108), (14.5, 13, 9.5)))
@@ -327,9 +323,7 @@ def head(cell: float = 1.25) -> Scene:
     face = union(1.2, face, carve(0.8, eyes, lids))
     face = carve(1.0, face, mouth, nostrils)
     ear = carve(
-        2.0,
-        ellipsoid((65, -8, 106), (7.5, 19, 29), (0, 0, -22)),
-        ellipsoid((73, -3, 109), (7.5, 12, 20), (0, 0, -22)),
+        2.0, ellipsoid((65, -8, 106), (7.5, 19, 29), (0, 0, -22)), ellipsoid((73, -3, 109), (7.5, 12, 20), (0, 0, -22))
     )
     cap = ridges(ellipsoid((0, -16, 137), (68.5, 79.5, 64)), 1.3, _strands)
     hair = carve(1.0, cap, half_space((0, -0.79, 0.613), 57.0))
@@ -382,7 +376,7 @@ def _height(p: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
 
 
 def _half_width(y: Float[ndarray, "n"]) -> Float[ndarray, "n"]:
-    """Of the outline: widest behind the middle, with a drawn-out tip and coarse teeth."""
+    """Half width of the outline: widest behind the middle, with a drawn-out tip and coarse teeth."""
     t = np.clip((y + _LENGTH / 2) / _LENGTH, 0.0, 1.0)
     smooth = 42.0 * np.sqrt(np.clip(np.sin(np.pi * t**0.8), 0, None)) * (1.12 - 0.55 * t)
     return smooth * (1 + 0.05 * np.sin(2 * np.pi * 9 * t))
@@ -545,8 +539,7 @@ def _faces(rings: int) -> Int[ndarray, "f 3"]:
 
 # Objects whose geometry hardly determines some motions of a frame: the hard cases of registration and adjustment.
 #
-# A frame may slide along planes, turn about an axis of revolution or about a sphere's centre, at hardly any cost.
-# Each
+# A frame may slide along planes, turn about an axis of revolution or about a sphere's centre, at hardly any cost. Each
 # object has a little that prevents it.
 
 _FROM_ABOVE = (45.0, 78.0)  # degrees: planes that lie down are seen from above

@@ -39,11 +39,6 @@ class Scene:
         return (self.vertices.min(0) + self.vertices.max(0)) / 2
 
     @cached_property
-    def radius(self) -> float:
-        """Radius of the sphere around `centre` that contains the object."""
-        return float(np.linalg.norm(self.vertices - self.centre, axis=1).max())
-
-    @cached_property
     def size(self) -> float:
         """Longest side of the bounding box."""
         return float(np.ptp(self.vertices, axis=0).max())
@@ -233,6 +228,6 @@ def _onto_level(
 
 
 def _gradient(field: Field, p: Float[ndarray, "n 3"], h: float) -> Float[ndarray, "n 3"]:
-    """From the values at the corners of a tetrahedron."""
+    """Gradient from the values at the corners of a tetrahedron."""
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=np.float64)
     return sum((field(p + h * e)[:, None] * e for e in corners), np.zeros_like(p)) / (4 * h)

@@ -28,7 +28,6 @@ from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
 from sl_nerfstudio.synthesis.devices import (
     DISTANCE,
     CoordinateNoise,
-    DeviceOptions,
     DevicePair,
     ExactMatches,
     NoisyCells,
@@ -41,7 +40,6 @@ from sl_nerfstudio.synthesis.devices import (
     pose_sigma,
 )
 from sl_nerfstudio.synthesis.photograph import (
-    FrameGeometry,
     Photograph,
     Shot,
     choose_useless,
@@ -50,6 +48,7 @@ from sl_nerfstudio.synthesis.photograph import (
     turn_away,
 )
 from sl_nerfstudio.synthesis.render import (
+    FrameGeometry,
     RayCaster,
     RenderedCapture,
     above_the_table,
@@ -113,22 +112,17 @@ class Setup:
 
     def render(self, frame: int, supersampling: int) -> RenderedCapture:
         """Frame number `frame`, without noise."""
-        return render_capture(
-            self.caster,
-            self.devices,
-            self.truth.T_world_camera[frame],
-            self.truth.T_world_projector[frame],
-            self.pattern,
-            self.appearance,
-            supersampling,
-        )
+        return render_capture(self._geometry(frame), self.pattern, self.appearance, supersampling)
 
     def photograph(self, frame: int, supersampling: int, photography: Photography, seed: int) -> Photograph:
         """Frame number `frame` as a camera takes it."""
-        poses = self.truth.T_world_camera[frame], self.truth.T_world_projector[frame]
-        stage = FrameGeometry(self.caster, self.devices, *poses)
         noise = random_stream(seed, Stream.SENSOR, frame)
-        return take_photograph(stage, photography.look, photography.shots[frame], supersampling, noise)
+        shot = photography.shots[frame]
+        return take_photograph(self._geometry(frame), photography.look, shot, supersampling, noise)
+
+    def _geometry(self, frame: int) -> FrameGeometry:
+        poses = self.truth.T_world_camera[frame], self.truth.T_world_projector[frame]
+        return FrameGeometry(self.caster, self.devices, *poses)
 
 
 def make_setup(config: SynthConfig) -> Setup:
@@ -139,10 +133,7 @@ def make_setup(config: SynthConfig) -> Setup:
     surroundings = make_surroundings(scene, config.background, random_stream(config.seed, Stream.SURROUNDINGS))
     pattern, layout = _make_pattern(config)
     truth = make_paths(scene, config.frames, config.path, random_stream(config.seed, Stream.PATHS))
-    options = DeviceOptions(
-        config.resolution, config.projector_model, config.camera_distortion, config.projector_distortion
-    )
-    devices = make_devices(scene, truth, (pattern.shape[1], pattern.shape[0]), options)
+    devices = make_devices(scene, truth, (pattern.shape[1], pattern.shape[0]), config)
     photography = _make_photography(config, scene, pattern)
     if photography is not None:
         away = [random_stream(config.seed, Stream.AWAY, n) for n in range(config.frames)]
@@ -150,7 +141,7 @@ def make_setup(config: SynthConfig) -> Setup:
     caster = RayCaster(scene, surroundings)
     noise = PoseNoise(*config.pose_error, *config.autocalibration_error, config.scale_known)
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
-    matches = [_matches(caster, devices, camera, projector) for camera, projector in pairs]
+    matches = [_matches(FrameGeometry(caster, devices, *poses)) for poses in pairs]
     start = disturb_poses(truth, noise, scene.centre, devices, matches, random_stream(config.seed, Stream.POSES))
     return Setup(
         scene=scene,
@@ -185,7 +176,7 @@ def _make_pattern(config: SynthConfig) -> tuple[Float32[ndarray, "h w"], Pattern
 
 
 def _make_photography(config: SynthConfig, scene: Scene, pattern: Float32[ndarray, "h w"]) -> Photography | None:
-    """None for plain images. A scan must have coordinates in every frame, so only captures have useless ones."""
+    """Look and shots; None for plain images. Scans need coordinates in every frame: only captures have useless ones."""
     if config.appearance == "plain":
         return None
     ranges, distance = RANGES[config.appearance], DISTANCE * scene.size
@@ -198,18 +189,16 @@ def _make_photography(config: SynthConfig, scene: Scene, pattern: Float32[ndarra
     return Photography(look, plan_shots(ranges, rngs, useless))
 
 
-def _matches(
-    caster: RayCaster,
-    devices: DevicePair,
-    T_world_camera: Float[ndarray, "4 4"],
-    T_world_projector: Float[ndarray, "4 4"],
-) -> ExactMatches:
+def _matches(frame: FrameGeometry) -> ExactMatches:
     """Exact correspondences on a coarse grid of pixels."""
     place = (np.arange(_REGISTRATION_GRID) + 0.5) / _REGISTRATION_GRID
-    uv = np.stack(np.meshgrid(place * devices.camera.w, place * devices.camera.h), -1).reshape(-1, 2)
-    seen = visible_points(caster, devices, T_world_camera, T_world_projector, uv)
+    camera = frame.devices.camera
+    uv = np.stack(np.meshgrid(place * camera.w, place * camera.h), -1).reshape(-1, 2)
+    seen = visible_points(frame, uv)
     return ExactMatches(uv[seen.lit], seen.uv_projector[seen.lit], seen.p_world[seen.lit])
 
+
+# Frames, rendered a few at a time, and the folders that hold them.
 
 TwoPoses = tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]]
 GAIN = 1.05  # exposure: a surface of mean albedo that faces the lamp in full light has 0.82 of full scale
@@ -321,7 +310,10 @@ def _to_8_bit(image: Float[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
 def _scan_writer(config: SynthConfig, setup: Setup, root: Path, folder: NewFolder) -> ScanWriter:
     extra: dict[str, Any] = {}
     if config.pose_sigma and setup.sigma is not None:
-        extra["sl_pose_sigma"] = sigma_fields(_scaled(setup.sigma, MILLIMETRES[config.units]))
+        factor = MILLIMETRES[config.units]
+        extra["sl_pose_sigma"] = {
+            key: value * (factor if "translation" in key else 1) for key, value in sigma_fields(setup.sigma).items()
+        }
     scale = Scale(True, "baseline of frame 0", _frame_name(0)) if config.scale_known else Scale(False)
     return ScanWriter(
         root,
@@ -332,14 +324,6 @@ def _scan_writer(config: SynthConfig, setup: Setup, root: Path, folder: NewFolde
         camera=setup.devices.camera,
         extra=extra,
         within=folder,
-    )
-
-
-def _scaled(sigma: PoseSigma, factor: float) -> PoseSigma:
-    return replace(
-        sigma,
-        camera_translation=sigma.camera_translation * factor,
-        relative_translation=sigma.relative_translation * factor,
     )
 
 
@@ -372,14 +356,6 @@ def _add_files(writer: ScanWriter, config: SynthConfig, setup: Setup, truth: str
             writer.add_file(f"{truth}{name}.ply", encode_ply(S_world_scene.points(part.vertices), part.faces))
 
 
-def _object_mask_path(frame: SyntheticFrame) -> str:
-    return f"object_masks/{frame.name}.png"
-
-
-def _encode_mask(mask: Bool[ndarray, "h w"]) -> bytes:
-    return encode_png(mask.astype(np.uint8) * np.uint8(255))
-
-
 def _captures_document(config: SynthConfig, setup: Setup) -> dict[str, Any]:
     """Which frames are of use, and what the others lack."""
     shots = [None] * config.frames if setup.photography is None else setup.photography.shots
@@ -400,7 +376,10 @@ def _write_scan(config: SynthConfig, setup: Setup, folder: NewFolder) -> None:
         for index, frame in enumerate(_frames(config, setup)):
             start, truth = (_world_poses(config, setup, poses, index) for poses in (setup.start, setup.truth))
             _add(writer, frame, start, truth)
-            writer.add_file(f"ground_truth/{_object_mask_path(frame)}", _encode_mask(frame.object_mask))
+            writer.add_file(
+                f"ground_truth/object_masks/{frame.name}.png",
+                encode_png(frame.object_mask.astype(np.uint8) * np.uint8(255)),
+            )
         _add_files(writer, config, setup, "ground_truth/")
 
 
@@ -410,7 +389,9 @@ def _write_captures(config: SynthConfig, setup: Setup, folder: NewFolder) -> Non
     with _scan_writer(exact, setup, folder.root / "ground_truth", folder) as truth:
         for index, frame in enumerate(_frames(exact, setup)):
             _add(truth, frame, _world_poses(exact, setup, setup.truth, index), None)
-            truth.add_file(_object_mask_path(frame), _encode_mask(frame.object_mask))
+            truth.add_file(
+                f"object_masks/{frame.name}.png", encode_png(frame.object_mask.astype(np.uint8) * np.uint8(255))
+            )
             folder.write(f"images/{frame.name}{frame.suffix}", frame.encoded)
         truth.add_file("captures.json", encode_json(_captures_document(config, setup)))
         _add_files(truth, exact, setup, "")

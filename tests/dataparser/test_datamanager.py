@@ -5,20 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
-from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, sl_data
-from sl_nerfstudio.errors import ScanError, UserError
-from sl_nerfstudio.geometry.devices import (
-    UNCHANGED,
-    Device,
-    Intrinsics,
-    IntrinsicsChange,
-    project,
-    unproject,
-)
+from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange, project, unproject
 from sl_nerfstudio.geometry.lie import inverse, transform
 from tests.dataparser.tiny_scan import CAMERA, TinyScan
 
@@ -90,15 +82,6 @@ def test_training_and_evaluation_pixels_are_disjoint(datamanager: SLDataManager)
     assert of_frames == {(i, *p) for i, item in enumerate(items) for p in item[..., 0].nonzero().tolist()}
 
 
-def test_held_out_batch_is_thinned_evenly(datamanager: SLDataManager) -> None:
-    for frame in range(3):
-        everything = datamanager.held_out_batch(frame, 10**6)[1]["indices"]
-        few = datamanager.held_out_batch(frame, 5)[1]["indices"]
-        assert len(few) == min(5, len(everything))
-        if len(everything) > 5:
-            assert few[0].tolist() == everything[0].tolist() and few[-1].tolist() == everything[-1].tolist()
-
-
 def test_a_step_has_the_same_batch_in_another_run(tiny_root: Path) -> None:
     one, other = manager(tiny_root), manager(tiny_root)
     for step in range(3):
@@ -108,24 +91,6 @@ def test_a_step_has_the_same_batch_in_another_run(tiny_root: Path) -> None:
     assert not torch.equal(other.next_train(7)[1]["indices"], one.next_train(8)[1]["indices"])
     first = one.next_train(9)[1]["indices"]
     assert not torch.equal(first, one.next_train(9)[1]["indices"])
-
-
-def test_exporters_set_the_number_of_rays_from_outside(tiny_root: Path) -> None:
-    m = manager(tiny_root)
-    m.train_pixel_sampler.num_rays_per_batch = 5000  # more than there are pixels in a frame
-    assert m.get_train_rays_per_batch() == 5000
-    assert len(m.next_train(0)[0]) == 5000
-
-
-def test_every_split_holds_all_frames_with_their_numbers(datamanager: SLDataManager) -> None:
-    for dataset in (datamanager.train_dataset, datamanager.eval_dataset):
-        assert dataset.cameras.metadata is not None
-        assert dataset.cameras.metadata["sl_view"].tolist() == [[0], [1], [2]]
-        assert len(dataset) == 3
-    for i, (camera, batch) in enumerate(datamanager.fixed_indices_eval_dataloader):
-        rays = camera.generate_rays(camera_indices=0, keep_shape=True)
-        assert (rays.metadata["sl_view"] == i).all() and rays.metadata["sl_view"].shape == (40, 48, 1)
-        assert batch["image_idx"] == i
 
 
 def test_whole_frames(datamanager: SLDataManager) -> None:
@@ -168,14 +133,6 @@ def test_downscaled_frames_keep_the_coordinates_of_their_pixels(tiny_root: Path)
     np.testing.assert_array_equal(item["coords"].numpy(), full[1::2, 1::2])
     # training still uses the full resolution
     assert int(m.next_train(0)[1]["indices"][:, 2].max()) > 24
-
-
-def test_nerfstudios_transform_restores_world_coordinates(datamanager: SLDataManager) -> None:
-    loaded = datamanager.dataparser.loaded
-    poses = datamanager.train_dataparser_outputs.transform_poses_to_original_space(
-        datamanager.train_dataset.cameras.camera_to_worlds, camera_convention="opengl"
-    )
-    np.testing.assert_allclose(poses.numpy(), loaded.scan.poses.T_world_camera[:, :3], atol=1e-3)
 
 
 def test_all_cameras_are_at_refined_poses(tiny_root: Path) -> None:
@@ -272,19 +229,3 @@ def test_a_change_in_percent_or_pixels_is_rejected(tiny_root: Path, which: int, 
     a, b, c, d, e, f = (value if which == k else 0.0 for k in range(6))
     with pytest.raises(UserError, match=r"(?s)intrinsics_change \(.*give shares of the focal length"):
         manager(tiny_root, dataparser=SLDataParserConfig(intrinsics_change=IntrinsicsChange.of((a, b, c, d, e, f))))
-
-
-def test_data_may_be_the_transforms_json_itself(tiny_root: Path) -> None:
-    assert sl_data.config.__class__ is SLDataParserConfig
-    assert len(manager(tiny_root / "transforms.json").train_dataset) == 3
-
-
-def test_other_dataparsers_are_rejected(tiny_root: Path) -> None:
-    config = SLDataManagerConfig(data=tiny_root, dataparser=NerfstudioDataParserConfig())
-    with pytest.raises(UserError, match="does not describe a projector"):
-        config.setup(device="cpu")
-
-
-def test_a_folder_that_is_not_a_scan(tmp_path: Path) -> None:
-    with pytest.raises(ScanError, match=r"transforms\.json"):
-        manager(tmp_path)

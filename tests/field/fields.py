@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from sl_nerfstudio.field.field import FieldConfig, SDFField
+from sl_nerfstudio.field.field import KNEE, FieldConfig, SDFField
 from sl_nerfstudio.field.torch_backend import encode, knee
 
 
@@ -29,7 +29,7 @@ def plain_sdf(field: SDFField, p: Tensor) -> Tensor:
     encoding = field.encoding
     h = torch.cat([q, encode(encoding.layout, encoding.table, encoding.level_weights, q)], -1)
     for layer in field.hidden:
-        h = knee(layer(h), field.config.knee)
+        h = knee(layer(h), KNEE)
     square = ((p - q) ** 2).sum(-1)
     outside = square > 0
     return field.last(h)[:, 0] + torch.where(outside, torch.where(outside, square, 1.0).sqrt(), 0.0)

@@ -5,14 +5,11 @@ import itertools
 import pytest
 import torch
 
-from sl_nerfstudio.field.hash_grid import PRIMES, GridLayout, HashGrid
+from sl_nerfstudio.field.hash_grid import PRIMES, GridLayout
 from sl_nerfstudio.field.torch_backend import corner_rows, corner_weights, encode
 
-LAYOUT = GridLayout.build(5, 16, 256, 8, 19, smooth=False)
-
-
-def small(smooth: bool = False, features: int = 2) -> GridLayout:
-    return GridLayout.build(3, 4, 16, features, 9, smooth)
+LAYOUT = GridLayout.build(5, 16, 256, 19)
+SMALL = GridLayout.build(3, 4, 16, 9)
 
 
 def test_the_papers_grid_has_levels_16_to_256_and_hashes_the_two_finest() -> None:
@@ -20,14 +17,9 @@ def test_the_papers_grid_has_levels_16_to_256_and_hashes_the_two_finest() -> Non
     assert LAYOUT.hashed == (False, False, False, True, True)
     assert LAYOUT.sizes[3:] == (2**19, 2**19)
     assert LAYOUT.width == 40
-    assert all(size >= (r + 1) ** 3 for size, r in zip(LAYOUT.sizes[:3], LAYOUT.resolutions, strict=False))
-
-
-def test_levels_are_consecutive_in_the_table_and_start_at_whole_cache_lines() -> None:
     ends = [offset + size for offset, size in zip(LAYOUT.offsets, LAYOUT.sizes, strict=True)]
-    assert LAYOUT.offsets == (0, *ends[:-1])
-    assert ends[-1] == LAYOUT.rows
-    assert all(offset % 8 == 0 for offset in LAYOUT.offsets)
+    assert LAYOUT.offsets == (0, *ends[:-1]) and ends[-1] == LAYOUT.rows
+    assert all(offset % 8 == 0 for offset in LAYOUT.offsets)  # whole cache lines
 
 
 @pytest.mark.parametrize("level", range(3))
@@ -52,7 +44,7 @@ def test_hashed_rows_are_those_of_the_published_hash() -> None:
 
 
 def test_a_dense_level_reproduces_a_trilinear_function_exactly() -> None:
-    layout = GridLayout.build(1, 8, 8, 1, 19, smooth=False)
+    layout = GridLayout.build(1, 8, 8, 19)
     axis = torch.linspace(-1, 1, 9, dtype=torch.float64)
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
 
@@ -66,34 +58,25 @@ def test_a_dense_level_reproduces_a_trilinear_function_exactly() -> None:
     torch.testing.assert_close(value, function(*p.unbind(-1)), atol=1e-12, rtol=0)
 
 
-@pytest.mark.parametrize("smooth", [False, True])
-def test_weights_sum_to_one_and_their_derivatives_are_torchs(smooth: bool) -> None:
+def test_weights_sum_to_one_and_their_derivatives_are_torchs() -> None:
     p = (torch.rand(50, 3, dtype=torch.float64) * 2 - 1).requires_grad_()
-    _, weight, slope = corner_weights(small(smooth), 1, p)
+    _, weight, slope = corner_weights(SMALL, 1, p)
     torch.testing.assert_close(weight.sum(1), torch.ones(50, dtype=torch.float64))
     for corner in range(8):
         (expected,) = torch.autograd.grad(weight[:, corner].sum(), p, retain_graph=True)
         torch.testing.assert_close(slope[:, corner], expected)
 
 
-def test_smoothstep_has_no_slope_at_the_faces_of_cells() -> None:
-    p = torch.tensor([[0.5, 0.1, -0.3]], dtype=torch.float64)  # on a face of x at resolution 8
-    _, _, slope = corner_weights(small(smooth=True), 1, p)
-    assert float(slope[0, :, 0].abs().max()) == 0
-    assert float(slope[0, :, 1].abs().max()) > 0.1
-
-
 @pytest.mark.parametrize("p", [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [1.0, -1.0, 0.0]])
 def test_the_corner_at_the_border_is_in_the_last_cell(p: list[float]) -> None:
-    layout = small()
-    cell, weight, _ = corner_weights(layout, 2, torch.tensor([p], dtype=torch.float64))
+    cell, weight, _ = corner_weights(SMALL, 2, torch.tensor([p], dtype=torch.float64))
     expected = [min(int((x + 1) * 8), 15) for x in p]
     assert cell[0].tolist() == expected
     assert float(weight.max()) <= 1 and float(weight.min()) >= 0
 
 
 def test_level_weights_scale_their_own_features_only() -> None:
-    layout = small()
+    layout = SMALL
     table = torch.randn(layout.rows, 2, dtype=torch.float64)
     p = torch.rand(20, 3, dtype=torch.float64) * 2 - 1
     full = encode(layout, table, torch.ones(3, dtype=torch.float64), p).view(20, 3, 2)
@@ -101,12 +84,7 @@ def test_level_weights_scale_their_own_features_only() -> None:
     torch.testing.assert_close(faded, full * torch.tensor([1, 0.25, 0], dtype=torch.float64)[:, None])
 
 
-def test_a_wrong_number_of_level_weights_is_rejected() -> None:
-    with pytest.raises(ValueError, match="expected 3 level weights, got \\(2,\\)"):
-        HashGrid(small()).set_level_weights(torch.ones(2))
-
-
-@pytest.mark.parametrize("arguments", [(0, 16, 256, 8), (5, 16, 8, 8), (5, 0, 8, 8), (5, 16, 32, 0)])
-def test_an_invalid_grid_is_rejected(arguments: tuple[int, int, int, int]) -> None:
+@pytest.mark.parametrize("arguments", [(0, 16, 256), (5, 16, 8), (5, 0, 8)])
+def test_an_invalid_grid_is_rejected(arguments: tuple[int, int, int]) -> None:
     with pytest.raises(ValueError, match="invalid grid"):
-        GridLayout.build(*arguments, 19, smooth=False)
+        GridLayout.build(*arguments, 19)

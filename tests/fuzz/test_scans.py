@@ -10,17 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sl_nerfstudio.errors import ScanError, UserError
-from sl_nerfstudio.scan import (
-    PickedPixel,
-    PoseSigma,
-    Scale,
-    ScaleBar,
-    Scan,
-    check_scan,
-    read_scan,
-)
+from sl_nerfstudio.scan import PickedPixel, PoseSigma, Scale, ScaleBar, check_scan, read_scan
 from tests.fuzz.damage import IMPOSSIBLE, at, damaged, places, removed, replaced
-from tests.fuzz.damage import Path as Place
 from tests.scan.sphere_scan import NAMES, write_sphere
 
 SIGMA = PoseSigma(3.0, 1.0, 2.0, 0.25)
@@ -30,7 +21,7 @@ few = settings(max_examples=40, deadline=None, derandomize=True, suppress_health
 
 
 @pytest.fixture(scope="module")
-def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def original(tmp_path_factory):
     root = write_sphere(tmp_path_factory.mktemp("fuzz") / "scan", frames=4, scale=Scale(True, "a ruler", bar=BAR))
     path = root / "transforms.json"
     document = json.loads(path.read_text())
@@ -40,12 +31,12 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def root(original: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def root(original, tmp_path_factory):
     """A copy to be damaged; every test puts back what it changed."""
     return Path(shutil.copytree(original, tmp_path_factory.mktemp("damaged") / "scan"))
 
 
-def pixels(scan: Scan) -> list[np.ndarray]:
+def pixels(scan):
     frames = [
         array for f in scan.frames for array in (f.read_image(), f.read_pattern(), f.read_coords(), f.read_mask())
     ]
@@ -54,7 +45,7 @@ def pixels(scan: Scan) -> list[np.ndarray]:
 
 @few
 @given(data=st.data())
-def test_impossible_values_are_refused(original: Path, root: Path, data: st.DataObject) -> None:
+def test_impossible_values_are_refused(original, root, data):
     document = json.loads((original / "transforms.json").read_text())
     place = data.draw(st.sampled_from(list(places(document))))
     value = data.draw(st.sampled_from(IMPOSSIBLE))
@@ -64,7 +55,7 @@ def test_impossible_values_are_refused(original: Path, root: Path, data: st.Data
     str(ScanError(faults)) if faults else read_scan(root)
 
 
-def may_stay(place: Place, value: object) -> bool:
+def may_stay(place, value):
     """Texts for people may be anything, what is optional may be absent, and -1 is a number like others."""
     key = place[-1]
     return (
@@ -77,7 +68,7 @@ def may_stay(place: Place, value: object) -> bool:
 
 @few
 @given(data=st.data())
-def test_missing_values_are_refused(original: Path, root: Path, data: st.DataObject) -> None:
+def test_missing_values_are_refused(original, root, data):
     document = json.loads((original / "transforms.json").read_text())
     place = data.draw(st.sampled_from(list(places(document))))
     (root / "transforms.json").write_text(json.dumps(removed(document, place)))
@@ -89,7 +80,7 @@ def test_missing_values_are_refused(original: Path, root: Path, data: st.DataObj
 
 @few
 @given(data=st.data())
-def test_a_damaged_file_is_refused_or_holds_the_same(original: Path, root: Path, data: st.DataObject) -> None:
+def test_a_damaged_file_is_refused_or_holds_the_same(original, root, data):
     files = sorted(p.relative_to(original) for p in original.rglob("*.*") if p.suffix in (".png", ".npz"))
     name = data.draw(st.sampled_from(files))
     content = (original / name).read_bytes()
@@ -105,7 +96,7 @@ def test_a_damaged_file_is_refused_or_holds_the_same(original: Path, root: Path,
 
 @few
 @given(data=st.data())
-def test_a_damaged_document_is_no_crash(original: Path, root: Path, data: st.DataObject) -> None:
+def test_a_damaged_document_is_no_crash(original, root, data):
     (root / "transforms.json").write_bytes(data.draw(damaged((original / "transforms.json").read_bytes())))
     if check_scan(root):
         with pytest.raises(UserError):
@@ -113,7 +104,7 @@ def test_a_damaged_document_is_no_crash(original: Path, root: Path, data: st.Dat
             raise ScanError(check_scan(root))
 
 
-def test_the_places_are_those_of_the_document(original: Path) -> None:
+def test_the_places_are_those_of_the_document(original):
     document = json.loads((original / "transforms.json").read_text())
     assert at(document, ("frames", 2, "transform_matrix", 0, 3)) in document["frames"][2]["transform_matrix"][0]
     assert len(list(places(document))) > 200

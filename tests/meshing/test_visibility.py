@@ -1,11 +1,20 @@
-"""Which frames see a vertex, and whether they confirm it: a plane by formula, and cases at the border of the mask."""
+"""Which frames see a vertex and whether they confirm it, and what is cut and stays."""
 
 from dataclasses import replace
+from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from jaxtyping import Float
+from numpy import ndarray
 
-from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3
+from sl_nerfstudio.geometry.triangulation import pixel_rays, world_pixels
+from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.visibility import (
     ENOUGH,
@@ -13,12 +22,15 @@ from sl_nerfstudio.meshing.visibility import (
     OFF_MASK_PX,
     FrameCounts,
     Occluder,
+    compare_decoded,
     count_frames,
+    packed_device,
+    trim_to_observed,
     visible_vertices,
 )
 from sl_nerfstudio.scan import Scan
 
-from .ray_cast_scan import CAMERA, PROJECTOR, look_at, scan_of
+from .ray_cast_scan import CAMERA, PROJECTOR, look_at, pairs_around, scan_of
 
 POSES = (look_at((60.0, 0.0, 290.0)), look_at((-40.0, 30.0, 290.0)))
 
@@ -73,18 +85,6 @@ def test_a_surface_at_another_height_is_predicted_wrong_by_the_parallax(scan):
     expected = np.linalg.norm(both[0] - both[1], axis=1)
     np.testing.assert_allclose(view.most, expected, rtol=0.02)
     assert expected.min() > LEAST_PX and (view.least > LEAST_PX).all()
-
-
-def test_vertices_that_face_away_or_are_hidden_are_not_seen(scan):
-    flipped = plate(20.0, 2.0)
-    flipped = Mesh(flipped.vertices, flipped.faces[:, ::-1].copy())
-    assert len(seen(flipped, scan).vertex) == 0
-    floor, roof = plate(20.0, 2.0), plate(25.0, 2.0, z=20.0)
-    both = Mesh(
-        np.concatenate([floor.vertices, roof.vertices]), np.concatenate([floor.faces, roof.faces + len(floor.vertices)])
-    )
-    below = np.abs(floor.vertices).max(1) < 10
-    assert not np.isin(np.flatnonzero(below), seen(both, scan).vertex).any()
 
 
 def test_outside_the_mask_the_distance_in_pixels_decides(scan):
@@ -147,3 +147,360 @@ def test_decided_vertices_keep_their_counts_in_a_second_pass(scan):
     after = count_frames(mesh, Occluder(mesh), replace(scan, frames=scan.frames[:1]), poses, before)
     assert (after.confirmed == np.where(decided, 7, 1)).all()
     assert (after.inconclusive == np.where(decided, 2, 0)).all() and (after.near_mask == after.inconclusive).all()
+
+
+MOST_PX = 16.0
+COUNT = 3000
+LENS = {"k1": -0.2, "k2": 0.05, "p1": 1e-3, "p2": -2e-3}
+PLAIN = Device(96, 80, 160.0, 150.0, 48.0, 40.0), Device(400, 300, 800.0, 780.0, 200.0, 150.0)
+BENT = Device(96, 80, 160.0, 150.0, 48.0, 40.0, **LENS), Device(400, 300, 800.0, 780.0, 200.0, 150.0, model="DOE")
+
+
+def jacobian(points, normals, uv, devices, poses) -> Float[ndarray, "n 2 2"]:
+    """Derivative of the predicted coordinate by the camera pixel's x and y, on the tangent plane."""
+    columns = []
+    for step in ((1.0, 0.0), (0.0, 1.0)):
+        camera = Intrinsics.of(devices[0], torch.float64)
+        origin, direction = pixel_rays(camera, torch.from_numpy(poses[0]), torch.from_numpy(uv[:, 0] + step))
+        o, d = origin.numpy(), direction.numpy()
+        towards = (d * normals).sum(1)
+        distance = ((points - o) * normals).sum(1) / np.where(towards < 0, towards, -1e-12)
+        there, _ = world_pixels(devices[1], poses[1], o + distance[:, None] * d)
+        columns.append((there - uv[:, 1]).clip(-MOST_PX, MOST_PX))
+    return np.stack(columns, -1)
+
+
+def at(coords: ndarray, row: ndarray, column: ndarray) -> ndarray:
+    return coords[np.clip(row, 0, coords.shape[0] - 1), np.clip(column, 0, coords.shape[1] - 1)].astype(float)
+
+
+def bounds(coords: ndarray, uv: ndarray, J: ndarray) -> tuple[ndarray, ndarray]:
+    """Bounds of the distance, by the rule that the compiled file states; which of them are bilinear."""
+    slope = np.linalg.norm(J, axis=(1, 2))
+    column, row = np.floor(uv[:, 0] - 0.5).astype(int).T
+    corners = np.stack([at(coords, row + dy, column + dx) - uv[:, 1] for dy, dx in product((0, 1), repeat=2)])
+    spread = np.linalg.norm(corners.max(0) - corners.min(0), axis=1)
+    x, y = (uv[:, 0] - 0.5 - np.stack([column, row], 1)).T[:, :, None]
+    value = (1 - y) * ((1 - x) * corners[0] + x * corners[1]) + y * ((1 - x) * corners[2] + x * corners[3])
+    whole = spread <= 2 * slope + 1
+    column, row = np.floor(uv[:, 0]).astype(int).T
+    nine = []
+    for dy, dx in product((-1, 0, 1), repeat=2):
+        away = np.stack([column + dx, row + dy], 1) + 0.5 - uv[:, 0]
+        off = at(coords, row + dy, column + dx) - uv[:, 1] - np.einsum("nij,nj->ni", J, away)
+        distance, bend = np.linalg.norm(off, axis=1), 0.5 * slope * np.linalg.norm(away, axis=1)
+        nine.append(((distance - bend).clip(min=0), distance))
+    best = np.fmin.reduce(np.array(nine))
+    return np.where(whole, np.linalg.norm(value, axis=1), best).T, whole
+
+
+@pytest.mark.parametrize("devices", [PLAIN, BENT], ids=["plain", "lens and DOE"])
+def test_bounds_are_those_of_the_formulas_for_arrays(devices: tuple[Device, Device]) -> None:
+    rng = np.random.default_rng(8)
+    poses = look_at((60.0, 0.0, 290.0)), look_at((-40.0, 30.0, 290.0))
+    points = np.column_stack([rng.uniform(-80, 80, (COUNT, 2)), rng.uniform(-10, 10, COUNT)])
+    normals = rng.normal(size=(COUNT, 3)) * 0.5 + [0, 0, 1]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    seen = [world_pixels(device, T, points) for device, T in zip(devices, poses, strict=True)]
+    which = np.flatnonzero(seen[0][1])
+    uv = np.stack([pixels for pixels, _ in seen], 1)[which]
+    # The coordinates of the plane z = 0, a step across the image, noise, and holes.
+    h, w = devices[0].h, devices[0].w
+    v, u = np.mgrid[:h, :w] + 0.5
+    origin, d = pixel_rays(
+        Intrinsics.of(devices[0], torch.float64), torch.from_numpy(poses[0]), torch.from_numpy(np.stack([u, v], -1))
+    )
+    ground = (origin - origin[..., 2:] / d[..., 2:] * d).numpy().reshape(-1, 3)
+    coords = world_pixels(devices[1], poses[1], ground)[0].reshape(h, w, 2) + rng.normal(0, 0.3, (h, w, 2))
+    coords[:, 50:] += 25
+    coords[rng.random((h, w)) < 0.2] = np.nan
+    coords[:20, :20] = np.nan
+    mask = rng.random((h, w)) < 0.8
+    grown = mask | (rng.random((h, w)) < 0.5)
+    coords = coords.astype(np.float32)
+
+    offsets, outside = np.full((len(which), 2), np.nan), np.empty((len(which), 2), dtype=bool)
+    packed = np.stack([packed_device(device, T) for device, T in zip(devices, poses, strict=True)])
+    compare_decoded(
+        *(len(which), points, normals, which, uv, coords, mask, grown, packed, MOST_PX, offsets, outside),
+    )
+    J = jacobian(points[which], normals[which], uv, devices, poses)
+    wanted, whole = bounds(coords, uv, J)
+    column, row = np.floor(uv[:, 0]).astype(int).T
+    assert np.array_equal(outside, np.stack([~grown[row, column], ~mask[row, column]], 1))
+    on = mask[row, column]
+    assert min((whole & on).sum(), (~whole & on).sum(), (on & np.isnan(wanted[:, 0])).sum()) > 40
+    assert (np.abs(J) == MOST_PX).any()
+    np.testing.assert_allclose(offsets[on], wanted[on], rtol=1e-7, atol=1e-7)
+    assert np.isnan(offsets[~on]).all()
+
+
+RADIUS = 40.0
+RING = pairs_around(6, elevation_deg=40)
+
+
+def ball(centre: tuple[float, float, float], radius: float, cell: float = 1.5) -> Mesh:
+    (x, y, z), r = centre, radius + 2 * cell
+    return extract_mesh(
+        lambda p: (p - p.new_tensor(centre)).norm(dim=-1) - radius,
+        round(2 * r / cell),
+        (x - r, y - r, z - r),
+        (x + r, y + r, z + r),
+    )
+
+
+def together(*parts: Mesh) -> Mesh:
+    offsets = np.cumsum([0, *(len(p.vertices) for p in parts)])[:-1]
+    return Mesh(
+        np.concatenate([p.vertices for p in parts]),
+        np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=True)]),
+    )
+
+
+def contains(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Which points are vertices of the mesh."""
+    known = {tuple(v) for v in mesh.vertices.round(9)}
+    return np.array([tuple(p) in known for p in points.round(9)])
+
+
+def angle_beyond_horizon_deg(points: np.ndarray) -> np.ndarray:
+    """For points of the ball at the origin: by how much the best frame sees and lights them (negative: not at all)."""
+    normals = points / np.linalg.norm(points, axis=1, keepdims=True)
+    height = [
+        np.min(
+            [
+                np.arcsin(((T[:3, 3] - points) * normals).sum(1) / np.linalg.norm(T[:3, 3] - points, axis=1))
+                for T in pair
+            ],
+            0,
+        )
+        for pair in RING
+    ]
+    return np.degrees(np.max(height, 0))
+
+
+def euler(mesh: Mesh) -> int:
+    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
+    return len(mesh.vertices) - len(np.unique(edges, axis=0)) + len(mesh.faces)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Mesh:
+    return ball((0.0, 0.0, 0.0), RADIUS)
+
+
+@pytest.fixture(scope="module")
+def ball_scan(truth, tmp_path_factory):
+    return scan_of(truth, RING, tmp_path_factory.mktemp("trim") / "scan")
+
+
+def test_the_unseen_side_of_a_ball_is_cut_at_its_horizon(truth, ball_scan):
+    result = trim_to_observed(truth, ball_scan)
+    kept = contains(result.mesh, truth.vertices)
+    margin = angle_beyond_horizon_deg(truth.vertices)
+    assert kept[margin > 18].all()  # the last pixel of the ball's image is 18 degrees of it
+    assert not kept[margin < -3].any()
+    assert euler(result.mesh) == 1  # one disk: no hole, no speck
+    assert result.total == len(truth.vertices) and result.unseen == pytest.approx((margin < 0).sum(), rel=0.25)
+    assert result.contradicted == 0 and result.closed < 20 and result.loose_pieces < 10  # the horizon is ragged
+
+
+TOWARDS_FIRST_CAMERA = np.array([np.cos(np.radians(40)), 0.0, np.sin(np.radians(40))])
+
+
+def test_a_phantom_in_front_goes_and_what_it_hid_stays(truth, tmp_path):
+    """One frame alone sees the phantom, and the surface behind it."""
+    ball_scan = scan_of(truth, RING[:1], tmp_path / "scan")
+    plain = trim_to_observed(truth, ball_scan).mesh
+    phantom = ball(tuple(62 * TOWARDS_FIRST_CAMERA), 9.0)
+    result = trim_to_observed(together(truth, phantom), ball_scan)
+    assert not contains(result.mesh, phantom.vertices).any()
+    assert np.array_equal(contains(result.mesh, truth.vertices), contains(plain, truth.vertices))
+    centre = 62 * TOWARDS_FIRST_CAMERA
+    faces = [((T[:3, 3] - phantom.vertices) * (phantom.vertices - centre)).sum(1) > 0 for T in RING[0]]
+    assert result.contradicted == pytest.approx((faces[0] & faces[1]).sum(), rel=0.1)
+
+
+def test_a_bulge_on_the_surface_goes(truth, ball_scan):
+    """Surface that is 8 mm too far out over a patch: every frame decodes something else there."""
+    towards = np.array([0.5, 0.0, np.sqrt(0.75)])
+    angle = np.degrees(np.arccos((truth.vertices / RADIUS @ towards).clip(-1, 1)))
+    bulged = Mesh(truth.vertices * (1 + 8 / RADIUS * np.clip((14 - angle) / 2, 0, 1))[:, None], truth.faces)
+    result = trim_to_observed(bulged, ball_scan)
+    kept = contains(result.mesh, bulged.vertices)
+    assert not kept[angle < 10].any()
+    assert kept[(angle > 20) & (angle_beyond_horizon_deg(truth.vertices) > 18)].all()
+
+
+def test_one_frame_that_sees_through_an_invented_patch_outweighs_two_that_decode_nothing_there(truth, tmp_path):
+    """A bulge over a patch that two of three frames do not decode, and one decodes where the object really is."""
+    towards, poses = np.array([0.0, 0.0, 1.0]), RING[::2]
+    angle = np.degrees(np.arccos((truth.vertices / RADIUS @ towards).clip(-1, 1)))
+    bulged = Mesh(truth.vertices * (1 + 5 / RADIUS * np.clip((8 - angle) / 2, 0, 1))[:, None], truth.faces)
+
+    def undecoded(number: int, coords: np.ndarray) -> np.ndarray:
+        if number == 1:
+            return coords
+        row, column = np.mgrid[: CAMERA.h, : CAMERA.w] + 0.5
+        x, y, z = np.linalg.solve(poses[number][0], [*(RADIUS * towards), 1.0])[:3]
+        u, v = CAMERA.cx - CAMERA.fl_x * x / z, CAMERA.cy + CAMERA.fl_y * y / z
+        return np.where((np.hypot(column - u, row - v) < 7)[..., None], np.float32(np.nan), coords)
+
+    result = trim_to_observed(bulged, scan_of(truth, poses, tmp_path / "scan", undecoded))
+    kept = contains(result.mesh, bulged.vertices)
+    assert not kept[angle < 6].any()
+    assert kept[(angle > 15) & (angle < 40)].all()
+
+
+def cells(number: int, share: float, across: int = 16, size: int = 6) -> np.ndarray:
+    """A share of the cells of size x size camera pixels, another one in each frame."""
+    chosen = np.random.default_rng(number).random((across, across)) < share
+    return np.kron(chosen, np.ones((size, size), dtype=bool))
+
+
+@pytest.mark.parametrize("share", [0.15, 0.5])
+def test_undecoded_cells_inside_the_mask_make_no_hole(truth, tmp_path, share):
+    camera = CAMERA.scaled(2.0)
+    whole = trim_to_observed(truth, scan_of(truth, RING, tmp_path / "a", camera=camera)).mesh
+    blank = np.float32(np.nan)
+    ball_scan = scan_of(
+        truth, RING, tmp_path / "b", lambda i, c: np.where(cells(i, share, 32)[..., None], blank, c), camera
+    )
+    holey = trim_to_observed(truth, ball_scan).mesh
+    assert euler(holey) == 1
+    assert len(holey.faces) == pytest.approx(len(whole.faces), rel=0.05)  # cells at the border are no gaps
+
+
+@pytest.mark.parametrize("frames", [1, 6])
+def test_wrongly_decoded_cells_make_no_hole(truth, tmp_path, frames):
+    """3 % wrong cells, off by 60 px; with one frame nothing else confirms the surface there."""
+    camera, poses = CAMERA.scaled(2.0), RING[:frames]
+    wrong = scan_of(
+        truth, poses, tmp_path / "a", lambda i, c: c + np.float32(60) * cells(i, 0.03, 96, 2)[..., None], camera
+    )
+    result = trim_to_observed(truth, wrong)
+    assert euler(result.mesh) == 1
+    assert len(result.mesh.faces) == pytest.approx(
+        len(trim_to_observed(truth, scan_of(truth, poses, tmp_path / "b", None, camera)).mesh.faces), rel=0.02
+    )
+    assert frames > 1 or result.closed > 0
+
+
+def test_noise_of_coordinates_and_poses_cuts_nothing(truth, ball_scan, tmp_path):
+    rng = np.random.default_rng(0)
+    noisy = scan_of(truth, RING, tmp_path / "scan", lambda i, c: c + rng.normal(0, 1, c.shape).astype(np.float32))
+    tilt = exp_se3(torch.tensor([0.5, -0.5, 0.5, 0.003, 0.002, -0.003], dtype=torch.float64)).numpy()
+    moved = DevicePoses(noisy.poses.T_world_camera @ tilt, noisy.poses.T_world_projector)
+    faces = len(trim_to_observed(truth, noisy, moved).mesh.faces)
+    assert faces == pytest.approx(len(trim_to_observed(truth, ball_scan).mesh.faces), rel=0.02)
+
+
+def test_shadows_and_hidden_parts_of_a_plane(tmp_path):
+    """One frame, a ball above a plane: the plane stays where the ball blocks neither camera nor projector."""
+    sphere, plane = ball((0.0, 0.0, 25.0), 12.0), plate(60.0, 1.0)
+    both = together(sphere, plane)
+    T_camera, T_projector = look_at((150.0, 0.0, 300.0)), look_at((-150.0, 60.0, 300.0))
+    result = trim_to_observed(both, scan_of(both, [(T_camera, T_projector)], tmp_path / "scan"))
+    kept = contains(result.mesh, plane.vertices)
+    clear = np.min(
+        [clearance(plane.vertices, T[:3, 3], np.array([0.0, 0.0, 25.0])) for T in (T_camera, T_projector)], 0
+    )
+    central = np.abs(plane.vertices).max(1) < 55
+    assert kept[central & (clear > 12 + 4)].all()  # a camera pixel is 2 mm here
+    assert not kept[clear < 12 - 4].any()
+
+
+def clearance(points: np.ndarray, eye: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Distance of the ball's centre from the way of each point to the eye."""
+    way = eye - points
+    t = ((centre - points) * way).sum(1) / (way * way).sum(1)
+    return np.linalg.norm(points + t.clip(0, 1)[:, None] * way - centre, axis=1)
+
+
+def box(bottom: float, top: float, half: float = 30.0) -> Mesh:
+    """A plate with upright sides."""
+    centre, size = (0.0, 0.0, (top + bottom) / 2), (half, half, (top - bottom) / 2)
+
+    def sdf(p: torch.Tensor) -> torch.Tensor:
+        q = (p - p.new_tensor(centre)).abs() - p.new_tensor(size)
+        return q.clamp_min(0).norm(dim=-1) + q.max(-1).values.clamp_max(0)
+
+    return extract_mesh(sdf, 41, (-41.0, -41.0, -41.0), (41.0, 41.0, 41.0))
+
+
+def test_the_sides_of_a_thin_plate_do_not_grow_downwards(tmp_path):
+    """The field goes on below the lower edge, where no frame decodes anything: silence is no proof there."""
+    ball_scan = scan_of(box(-4.0, 4.0), RING, tmp_path / "scan")
+    grown = box(-33.0, 4.0)
+    result = trim_to_observed(grown, ball_scan).mesh
+    kept = result.vertices
+    # a camera pixel is 1.9 mm, so 2.5 mm of a side seen from 40 degrees above; a cell is 2 mm
+    assert kept[:, 2].min() > -4 - 2.5 - 2
+    top = grown.vertices[grown.vertices[:, 2] > 3.9]
+    assert contains(result, top[np.abs(top[:, :2]).max(1) < 27]).all()
+    side = grown.vertices[(np.abs(grown.vertices[:, :2]).max(1) > 29.9) & (np.abs(grown.vertices[:, 2]) < 2)]
+    assert len(side) and contains(result, side).all()  # the true sides stay
+
+
+def test_frames_that_look_along_a_side_do_not_say_how_far_it_reaches(tmp_path):
+    """From 80 degrees above, a pixel is 11 mm of an upright side; frames from 15 degrees see its edge to 2 mm."""
+    poses = pairs_around(6, elevation_deg=80) + pairs_around(6, elevation_deg=15)
+    result = trim_to_observed(box(-13.0, 4.0), scan_of(box(-4.0, 4.0), poses, tmp_path / "scan")).mesh
+    assert -4 - 2.5 < result.vertices[:, 2].min() < -2
+
+
+def test_a_floating_piece_that_no_frame_confirms_goes(truth, tmp_path):
+    """In front of it nothing was decoded at all, so nothing denies it: but nothing confirms it either."""
+    phantom = ball(tuple(58 * TOWARDS_FIRST_CAMERA), 6.0)
+    both = together(truth, phantom)
+    blind = [covered_pixels(T_camera, phantom.vertices) for T_camera, _ in RING]
+    ball_scan = scan_of(
+        truth, RING, tmp_path / "scan", lambda i, c: np.where(blind[i][..., None], np.float32(np.nan), c)
+    )
+    result = trim_to_observed(both, ball_scan)
+    assert result.loose_pieces > 0
+    assert not contains(result.mesh, phantom.vertices).any()
+
+
+def covered_pixels(T_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Pixels within two of a projection of the points."""
+    p = (points - T_camera[:3, 3]) @ T_camera[:3, :3]
+    u, v = 160 * p[:, 0] / -p[:, 2] + 48, -160 * p[:, 1] / -p[:, 2] + 48
+    out = np.zeros((96, 96), dtype=bool)
+    for dy in range(-2, 3):
+        for dx in range(-2, 3):
+            out[(v + dy).astype(int).clip(0, 95), (u + dx).astype(int).clip(0, 95)] = True
+    return out
+
+
+def test_given_poses_replace_those_of_the_scan(truth, ball_scan):
+    S = Similarity(
+        1.0,
+        exp_se3(torch.tensor([0, 0, 0, 0.3, -0.2, 0.9], dtype=torch.float64)).numpy()[:3, :3],
+        np.array([500.0, -20, 7]),
+    )
+    moved = trim_to_observed(truth.mapped(S), ball_scan, ball_scan.poses.mapped(S)).mesh
+    assert len(moved.faces) == pytest.approx(len(trim_to_observed(truth, ball_scan).mesh.faces), rel=2e-3)
+
+
+def test_wrong_poses_say_so(truth, ball_scan):
+    upside_down = np.diag([1.0, -1.0, -1.0, 1.0])
+    with pytest.raises(
+        UserError,
+        match=r"the frames observed no part(.|\n)*no vertex that faces camera and projector is inside a mask"
+        r"(.|\n)*sl-check(.|\n)*--keep-unobserved",
+    ):
+        poses = DevicePoses(
+            ball_scan.poses.T_world_camera @ upside_down, ball_scan.poses.T_world_projector @ upside_down
+        )
+        trim_to_observed(truth, ball_scan, poses)
+
+
+def test_another_surface_says_so(ball_scan):
+    with pytest.raises(UserError, match=r"coordinates are not the decoded ones; they differ by \d+ px"):
+        trim_to_observed(ball((0.0, 0.0, -70.0), 25.0), ball_scan)
+
+
+def test_missing_mask_files_mean_decoded_pixels(truth, ball_scan, tmp_path: Path):
+    without = replace(ball_scan, frames=tuple(replace(f, mask_path=None) for f in ball_scan.frames))
+    assert len(trim_to_observed(truth, without).mesh.faces) == len(trim_to_observed(truth, ball_scan).mesh.faces)

@@ -19,11 +19,6 @@ def test_means_and_deviations_over_the_frames_that_have_a_value() -> None:
     assert mean_over_frames(frames, with_std=False) == {"a": 4.0, "b": 5.0}
 
 
-def test_one_frame_has_a_deviation_of_zero() -> None:
-    assert mean_over_frames([{"a": 2.0}], with_std=True) == {"a": 2.0, "a_std": 0.0}
-    assert mean_over_frames([], with_std=True) == {}
-
-
 def test_commands_to_continue_with_are_quoted_for_a_shell() -> None:
     text = what_next(Path("/a b/it's/config.yml"), Path("/scan"), 0.9)
     assert """ns-viewer --load-config '/a b/it'"'"'s/config.yml'""" in text

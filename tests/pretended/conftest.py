@@ -34,6 +34,7 @@ def begin(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> C
     """Begins a run with few pixels and a small field; the second of two levels begins at step 1, rendering at 3."""
 
     monkeypatch.setattr("sl_nerfstudio.model.model.CachedGrid", partial(CachedGrid, 24))
+    monkeypatch.setattr("sl_nerfstudio.rendering.losses.LEVELS_AT_START", 1)
 
     def begun(method: str, change: Callable[[SLTrainerConfig], Any] | None = None, **more: Any) -> Training:
         config = settings(method, tiny_root, tmp_path, more.pop("device", "cuda"), STEPS)
@@ -43,7 +44,6 @@ def begin(tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> C
         model.warm_start = 0.15 if method == "sl-neus" else 0.0
         sdf, sampling = model.sdf, model.sampling
         sdf.backend, sdf.log2_table_size, sdf.max_resolution, sdf.hidden, sdf.levels = "torch", 10, 32, 16, 2
-        model.annealing.levels_at_start = 1
         sampling.render_rays, sampling.samples, sampling.eikonal_points = 16, 8, 16
         if change is not None:
             change(config)

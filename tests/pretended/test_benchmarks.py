@@ -11,6 +11,7 @@ from sl_nerfstudio.dataparser.dataparser import load_scan
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 
 
+@pytest.mark.slow
 def test_launches_and_waits_of_a_step_are_counted(tiny_root, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(launches, "_COUNTED", 2)
     output = tmp_path / "launches.json"
@@ -22,6 +23,7 @@ def test_launches_and_waits_of_a_step_are_counted(tiny_root, tmp_path, capsys, m
     assert "warp encode" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_everything_about_a_gpu_can_be_tried_on_the_cpu(tiny_root, tmp_path, monkeypatch):
     """With a smaller field, on a scan without a truth."""
 

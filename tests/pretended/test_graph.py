@@ -31,6 +31,7 @@ def trained(begin, recorder, method, backend, steps):
         return used, rates, {name: x.cpu() for name, x in training.model.state_dict().items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method, backend, steps", [("sl-neus", "warp", 10), ("sl-neus-paper", "warp", 5)])
 def test_a_recording_gives_the_same_training(begin, method, backend, steps):
     recorder, rates, recorded = trained(begin, PretendedRecorder, method, backend, steps)

@@ -24,8 +24,8 @@ def adjusted_at_once(scan, S_scene_world, samples, refine, prior, settings):
     """The adjustment runs on the CPU, and takes seconds."""
     rig = scene_rig(scan, S_scene_world)
     prior = pose_prior(scan, S_scene_world, prior)
-    decision = CrossValidation(0.1, 0.05, -0.01, 0.001, 3.0, 0.01)
-    return ScanAdjustment(rig, prior.sigma, joint_of_prior(prior, rig), decision, 0.1, None, (1,))
+    decision = CrossValidation(0.1, 0.05, -0.01, 0.001, 0.01)
+    return ScanAdjustment(rig, prior.sigma, joint_of_prior(prior, rig), 0.1, None, (1,), decision)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_a_pixel_table_that_does_not_fit_is_copied_batch_by_batch(begin, monkeyp
         training.step()
         with gpu.counting() as seen:
             training.step()
-        assert seen.waits and all("samples.py" in place for place in seen.waits), dict(seen.waits)
+        assert seen.waits and all("dataparser.py" in place for place in seen.waits), dict(seen.waits)
 
 
 def test_the_pretended_gpu_finds_what_a_gpu_refuses_or_waits_for():

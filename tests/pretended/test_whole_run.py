@@ -16,6 +16,7 @@ from sl_nerfstudio.runs.export_settings import ExportSettings
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 
 
+@pytest.mark.slow
 def test_a_whole_run(begin, tmp_path):
     with PretendedGpu():
         training = begin("sl-neus")

@@ -1,11 +1,20 @@
-"""Captures are found in their order, and faulty ones are named."""
+"""Captures are found in their order and with their pattern; faulty ones are named with all their faults."""
+
+import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from sl_nerfstudio.calibration.formats import camera_names, read_device_file
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.processing.captures import find_captures
+from sl_nerfstudio.pattern.gray_code import GrayCode
+from sl_nerfstudio.processing.captures import find_captures, incomplete
+from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.inputs import read_captured
+from sl_nerfstudio.scan.images import encode_png
+from tests.decoding.gray_captures import exact_coords, photographs
 
 
 def _write(path, w=16, h=12, mode="L"):
@@ -51,11 +60,7 @@ def test_images_of_another_size_and_unreadable_ones_are_faults_of_their_frames(t
     ("sequences", "files", "message"),
     [
         (False, ["a.png"], "holds 1 images; a scan needs at least 2 frames"),
-        (
-            False,
-            ["x/1.png", "y/1.png"],
-            "holds 0 images.*\n.*do not suit the pattern: a coded grid needs",
-        ),
+        (False, ["x/1.png", "y/1.png"], "holds 0 images.*\n.*do not suit the pattern: a coded grid needs"),
         (True, ["1.png", "2.png"], "holds 0 folders with images.*\n.*do not suit the pattern"),
         (False, ["a.png", "a.jpg", "b.png"], "several images named a"),
     ],
@@ -68,13 +73,100 @@ def test_folders_that_hold_no_captures(tmp_path, sequences, files, message):
     assert "remedy:" in str(caught.value)
 
 
-def test_no_folder_at_all(tmp_path):
-    with pytest.raises(UserError, match=r"nowhere: is no folder"):
-        find_captures(tmp_path / "nowhere", sequences=False)
-
-
 def test_when_nothing_can_be_read_the_first_reason_is_given(tmp_path):
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(100))
     with pytest.raises(UserError, match=r"a\.png: is not an image that can be read"):
         find_captures(tmp_path, sequences=False)
+
+
+SIZE = (320, 240)
+
+
+OPENCV = GrayCode.in_order("opencv", *SIZE, 1)
+
+
+@pytest.fixture(scope="module")
+def sequence():
+    return photographs(exact_coords(), layout=OPENCV)
+
+
+def write(folder, images):
+    folder.mkdir(parents=True)
+    for k, image in enumerate(images):
+        (folder / f"{k:02d}.png").write_bytes(encode_png(image))
+
+
+def config(tmp_path, **changes):
+    names = ("images", "pattern", "intrinsics", "output")
+    return replace(ProcessConfig(*(tmp_path / name for name in names)), **changes)
+
+
+def test_the_order_is_recognised_and_reported(tmp_path, sequence):
+    from pathlib import Path
+
+    for name in ("a", "b"):
+        write(tmp_path / "images" / name, sequence)
+    captured = read_captured(config(tmp_path, pattern=Path("320x240"), intrinsics=tmp_path / "i.yml"))
+    assert captured.decoder.layout == OPENCV and captured.notes.recognised
+    assert captured.notes.sentences == (
+        "Gray code of 320 x 240 pixels in cells of 1: 36 images, order opencv, procam, recognised from the images",
+    )
+    named = config(tmp_path, pattern=Path("320x240"), sequence="opencv", intrinsics=tmp_path / "i.yml")
+    assert read_captured(named).decoder.layout == OPENCV and not read_captured(named).notes.recognised
+    with pytest.raises(UserError, match=r"images/a: holds 36 images; .* have other numbers: no-inverses: 19"):
+        read_captured(replace(named, sequence="no-inverses"))
+
+
+def test_all_faults_of_a_frame_are_told_at_once(tmp_path, sequence):
+    for name in ("a", "b"):
+        write(tmp_path / name, sequence)
+    (tmp_path / "b" / "17.png").unlink()
+    (tmp_path / "b" / "20.png").write_bytes(encode_png(sequence[0][:-10]))
+    (tmp_path / "b" / "30.png").write_bytes(b"")
+    captures = find_captures(tmp_path, True)
+    captures = captures.with_faults(incomplete(captures, OPENCV))
+    assert list(captures.faults) == ["b"]
+    said = str(captures.faults["b"])
+    for part in ("b: has 3 faults", "30.png is empty", "20.png is 200 x 140 pixels, most images are 200 x 150",
+                 "the folder holds 35 images, the sequence of the pattern has 36 (by the names, 17 is missing)",
+                 "cause:", "resized, cropped", "images are missing or too many", "remedy:"):  # fmt: skip
+        assert part in said
+
+
+def test_several_cameras_take_turns_each_with_its_own_intrinsics(tmp_path):
+    entry = {"fl_x": 60.0, "fl_y": 60.0, "cx": 8.0, "cy": 6.0}
+    document = {"cameras": {"left": {"w": 16, "h": 12, **entry}, "right": {"w": 20, "h": 10, **entry, "fl_x": 70.0}}}
+    path = tmp_path / "i.json"
+    path.write_text(json.dumps(document))
+    assert camera_names(path) == ("left", "right")
+    for name, size in (("left", (16, 12)), ("right", (20, 10))):
+        (tmp_path / "c" / name).mkdir(parents=True)
+        for k in range(2):
+            Image.new("L", size, 90).save(tmp_path / "c" / name / f"{k}.png")
+    captures = find_captures(tmp_path / "c", False, camera_names(path))
+    assert [frame.name for frame in captures.frames] == ["left_0", "right_0", "left_1", "right_1"]
+    assert captures.sizes == {"left": (16, 12), "right": (20, 10)} and not captures.faults
+    devices = {n: read_device_file(path, "camera", s, name=n) for n, s in captures.sizes.items()}
+    assert (devices["left"].fl_x, devices["right"].fl_x, devices["right"].w) == (60.0, 70.0, 20)
+    (tmp_path / "c" / "right").rename(tmp_path / "c" / "rechts")
+    with pytest.raises(UserError, match="has the folders left, rechts, the intrinsics file the cameras left, right"):
+        find_captures(tmp_path / "c", False, camera_names(path))
+
+
+def test_a_photograph_turned_by_its_tag_is_told_from_a_cropped_one(tmp_path):
+    for k in range(3):
+        Image.new("L", (16, 12), 90).save(tmp_path / f"{k}.jpg")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("L", (16, 12), 90).save(tmp_path / "3.jpg", exif=exif)
+    fault = str(find_captures(tmp_path, False).faults["3"])
+    assert "is 12 x 16 pixels, most images are 16 x 12" in fault and "as the image's EXIF tag says" in fault
+
+
+def test_a_video_of_gray_code_is_refused(tmp_path):
+    (tmp_path / "pattern").write_bytes(OPENCV.encode())
+    (tmp_path / "pattern").rename(tmp_path / "p.json")
+    (tmp_path / "v.mp4").write_bytes(b"x")
+    with pytest.raises(UserError, match=r"v.mp4: is a video, and Gray code needs one image for each pattern"):
+        read_captured(config(tmp_path, images=tmp_path / "v.mp4", pattern=tmp_path / "p.json"))

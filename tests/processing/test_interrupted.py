@@ -14,6 +14,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
 from sl_nerfstudio.processing import frames
 from sl_nerfstudio.processing import process as stages
+from sl_nerfstudio.processing.cache import VERSIONS
 from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.process import process
 from sl_nerfstudio.processing.records import digest
@@ -88,13 +89,18 @@ def test_nothing_is_computed_again(whole, resumed, monkeypatch):
     assert content(resumed.output) == content(whole / "s")
 
 
-@pytest.mark.parametrize("change", [{"unordered": True}, {"seed": 1}, {"poses": True}])
-def test_with_other_settings_frames_are_registered_again(ramp_scan, resumed, change, monkeypatch, tmp_path):
+@pytest.mark.parametrize("change", [{"unordered": True}, {"seed": 1}, {"poses": True}, {"version": True}])
+def test_with_other_settings_or_another_version_frames_are_registered_again(
+    ramp_scan, resumed, change, monkeypatch, tmp_path
+):
     if "poses" in change:
         frames = zip(NAMES, ramp_scan.T_world_camera.tolist(), strict=True)
         document = {"frames": [{"file_path": f"{name}.png", "transform_matrix": T} for name, T in frames]}
         change = {"poses": tmp_path / "rough.json"}
         change["poses"].write_text(json.dumps(document))
+    elif "version" in change:
+        change = {}
+        monkeypatch.setitem(VERSIONS, "registration", VERSIONS["registration"] + 1)
     monkeypatch.setattr(stages, "register", lambda *_: pytest.fail("registered again"))
     with pytest.raises(pytest.fail.Exception, match="registered again"):
         run(replace(resumed, **change))

@@ -9,19 +9,26 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import fit_similarity
 from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing import process as stages
-from sl_nerfstudio.processing.inputs import GivenPoses, frames_by_name, read_inputs
-from sl_nerfstudio.processing.process import process, require_given_poses
-from sl_nerfstudio.registration.result import NoCommonSurface, parse_known_length
+from sl_nerfstudio.processing.captures import find_captures
+from sl_nerfstudio.processing.frames import FrameWorker, clouds_of
+from sl_nerfstudio.processing.inputs import GivenPoses, frames_by_name
+from sl_nerfstudio.processing.process import process, require_given_poses, write_scan
+from sl_nerfstudio.processing.result import summarise
+from sl_nerfstudio.processing.scan_poses import find_scan_poses
+from sl_nerfstudio.registration.register import ProjectorChoice, register
+from sl_nerfstudio.registration.result import NoCommonSurface, Registration, UndecidedProjector, parse_known_length
 from sl_nerfstudio.scan import check_scan, read_scan
-from tests.processing.conftest import register_ramps
-from tests.processing.ramp_scan import NAMES
+from sl_nerfstudio.scan.images import read_image
+from sl_nerfstudio.storage import NewFolder
+from tests.processing.conftest import SHORT, register_ramps
+from tests.processing.ramp_scan import LAYOUT, NAMES
 
-pytestmark = [pytest.mark.usefixtures("ramps_registered", "calibrated_before"), pytest.mark.slow]
-
+pytestmark = pytest.mark.usefixtures("ramps_registered", "calibrated_before")
 
 ALONE = "no other frame shows any of its surface; capture views in between"
 
@@ -95,6 +102,7 @@ def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, whole):
     assert angles.max() < 0.3
 
 
+@pytest.mark.slow
 def test_without_the_adjustment_the_poses_are_those_of_the_registration_and_sigma_covers_them(
     monkeypatch, whole, ramp_scan, tmp_path
 ):
@@ -119,12 +127,6 @@ def test_without_the_adjustment_the_poses_are_those_of_the_registration_and_sigm
         assert error < 3 * (rough.pose_sigma.camera_translation + np.radians(1.0) * distance)
 
 
-@pytest.mark.parametrize("more", [{"rig": "rigid"}, {"rig": "static-projector"}, {"estimate_projector": True}])
-def test_what_only_the_adjustment_can_do_cannot_be_asked_for_without_it(ramp_scan, tmp_path, more):
-    with pytest.raises(UserError, match=r"--no-adjust and --(rig|estimate-projector)"):
-        _run(ramp_scan.config(tmp_path / "s", no_adjust=True, **more))
-
-
 def test_frames_that_do_not_register_are_left_out_of_the_scan(lose, ramp_scan, tmp_path):
     lose(NAMES[3])
     result, log = _run(ramp_scan.config(tmp_path / "s"))
@@ -133,19 +135,6 @@ def test_frames_that_do_not_register_are_left_out_of_the_scan(lose, ramp_scan, t
     assert result.frames[3].reason == ALONE
     assert f"{NAMES[3]}: capture it again; it was left out ({result.frames[3].reason})" in result.recapture
     assert (tmp_path / "s" / "processing.html").read_text() == "3 of 4"
-
-
-def test_a_frame_that_registration_left_out_is_placed_after_the_adjustment(lose, ramp_scan, tmp_path):
-    lose(NAMES[3], back=True)
-    result, log = _run(ramp_scan.config(tmp_path / "s"))
-    assert "registered 3 of 4 frames" in log
-    assert f"placed against the adjusted frames: {NAMES[3]}; adjusting again with them" in log
-    assert [frame.name for frame in read_scan(tmp_path / "s").frames] == list(NAMES)
-    assert all(frame.in_scan for frame in result.frames) and result.recapture == ()
-    found, true = read_scan(tmp_path / "s").poses.T_world_camera, ramp_scan.T_world_camera
-    S = fit_similarity(found[:, :3, 3], true[:, :3, 3])
-    distance = np.linalg.norm(true[:, :3, 3], axis=1).mean()
-    assert np.linalg.norm(S.points(found[:, :3, 3]) - true[:, :3, 3], axis=1).max() < 2e-3 * distance
 
 
 def test_fewer_than_two_registered_frames_are_an_error_with_a_report(lose, ramp_scan, tmp_path):
@@ -178,18 +167,6 @@ def test_too_few_registered_frames_with_given_poses_are_an_error_that_names_them
     assert "\n    cause:  " in said and said.endswith("or leave --poses out") and not config.output.exists()
 
 
-def test_given_poses_of_frames_that_cannot_be_decoded_do_not_count(ramp_scan, tmp_path):
-    shutil.copytree(ramp_scan.root, tmp_path / "c")
-    (tmp_path / "c" / "images" / NAMES[0] / "0.png").write_bytes(b"broken")
-    rough = _poses(tmp_path / "r.json", {name: ramp_scan.T_world_camera[k] for k, name in enumerate(NAMES[:2])})
-    copy = replace(ramp_scan, root=tmp_path / "c")
-    with pytest.raises(UserError, match="1 of the 2 frames with given poses could be registered") as caught:
-        _run(copy.config(tmp_path / "s", poses=rough))
-    said = str(caught.value)
-    assert f"{NAMES[0]}: left out in reading: " in said and "0.png: is not an image that can be read" in said
-    assert f"{NAMES[1]}: registered" in said
-
-
 def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):
     """Which is said before anything is decoded."""
     turned = ramp_scan.T_world_camera.copy()
@@ -204,7 +181,7 @@ def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):
 def test_other_places_of_frames_that_are_left_out_give_no_unit(ramp_scan, tmp_path, monkeypatch):
     T = ramp_scan.T_world_camera.copy()
     T[:3, :3, 3] = (1, 2, 3)
-    lost = SimpleNamespace(stage="registering", reason="alone")
+    lost = "registering", "alone"
     monkeypatch.setattr(stages, "left_out", lambda result, _: lost if result.name == NAMES[3] else None)
     results = [SimpleNamespace(name=name) for name in NAMES]
     config = ramp_scan.config(tmp_path / "s", poses=tmp_path / "r.json")
@@ -212,6 +189,7 @@ def test_other_places_of_frames_that_are_left_out_give_no_unit(ramp_scan, tmp_pa
         inspect.unwrap(require_given_poses)(config, GivenPoses(T, "mm"), results, None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("units", ["mm", "arbitrary"])
 def test_given_poses_give_axes_and_unit(ramp_scan, tmp_path, units):
     rough = _poses(tmp_path / "r.json", dict(zip(NAMES[:3], ramp_scan.T_world_camera[:3], strict=True)), units)
@@ -223,6 +201,7 @@ def test_given_poses_give_axes_and_unit(ramp_scan, tmp_path, units):
     assert (scan.scale.known, result.scale_source) == (units == "mm", source)
 
 
+@pytest.mark.slow
 def test_a_known_length_overrules_the_unit_of_given_poses(ramp_scan, tmp_path):
     rough = _poses(tmp_path / "r.json", dict(zip(NAMES, ramp_scan.T_world_camera, strict=True)))
     _run(ramp_scan.config(tmp_path / "s", poses=rough, known_length="baseline of frame 2 = 5 cm"))
@@ -251,11 +230,132 @@ def test_frames_of_a_known_length_are_found_by_number_or_name():
             frames_by_name(parse_known_length(text), ["a", "b", "c"])
 
 
-def test_inputs_are_read_before_anything_is_written(ramp_scan, tmp_path):
-    before = sorted(tmp_path.rglob("*"))
-    inputs = read_inputs(ramp_scan.config(tmp_path / "s", known_length="baseline of frame 3 = 1 m"))
-    assert [frame.name for frame in inputs.captures.frames] == list(NAMES)
-    assert inputs.known.frames == (NAMES[3],) and inputs.given is None
-    assert inputs.job.decoder.name == "ramps" and inputs.job.work == tmp_path / "s.work"
-    assert (inputs.job.camera, inputs.job.projector) == (ramp_scan.camera, ramp_scan.projector)
-    assert sorted(tmp_path.rglob("*")) == before
+ABC = ("a", "b", "c")
+
+
+ORDER = "the frames do not follow each other in the order of capture: --unordered says so"
+
+
+DOUBT = UndecidedProjector("b", 20.0)
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Makes the choices of projectors, by neighbours and by all; lists what is registered, by which order."""
+
+    def registered(by_neighbours, by_all, in_order=False):
+        calls = []
+
+        def register(chosen, sequence, *_):
+            calls.append((chosen, sequence))
+            poses = np.tile(np.eye(4) * (1 + len(calls)), (3, 1, 1))
+            return Registration(ABC, poses, np.ones(3), np.ones(3, dtype=bool), np.zeros(3, dtype=np.int64),
+                                np.ones(3), (), (), (), ordered=sequence and in_order)  # fmt: skip
+
+        doubts = {True: (), False: (DOUBT,)}
+        choices = {True: by_neighbours, False: by_all}
+        monkeypatch.setattr(
+            stages,
+            "choose_projectors",
+            lambda clouds, sequence, _: ProjectorChoice(choices[sequence], doubts[sequence]),
+        )
+        monkeypatch.setattr(stages, "chosen_clouds", lambda clouds, chosen: chosen)
+        monkeypatch.setattr(stages, "register", register)
+        return calls
+
+    return registered
+
+
+def number(registration):
+    """Which of the calls made it."""
+    return registration.T_world_camera[0, 0, 0] - 1
+
+
+def register_abc(unordered):
+    log = []
+    return *stages.register_clouds([], unordered, 0, None, log.append), log
+
+
+def test_the_same_poses_are_registered_once_and_what_all_frames_say_of_them_counts(registered):
+    calls = registered((0, 1, 0), (0, 1, 0))
+    chosen, found, log = register_abc(unordered=False)
+    assert calls == [((0, 1, 0), True)] and log == [ORDER]
+    assert chosen == (0, 1, 0) and found.exclusions == (DOUBT,) and number(found) == 1
+
+
+def test_other_poses_are_registered_again(registered):
+    calls = registered((0, 1, 0), (0, 0, 0))
+    chosen, found, log = register_abc(unordered=False)
+    assert calls == [((0, 1, 0), True), ((0, 0, 0), False)] and log == [ORDER]
+    assert chosen == (0, 0, 0) and found.exclusions == (DOUBT,) and number(found) == 2
+
+
+@pytest.mark.parametrize("unordered", [False, True])
+def test_where_the_order_is_known_nothing_is_repeated(registered, unordered):
+    calls = registered((0, 1, 0), (0, 0, 0), in_order=True)
+    chosen, found, log = register_abc(unordered)
+    wanted = (0, 0, 0) if unordered else (0, 1, 0)
+    assert calls == [(wanted, not unordered)] and chosen == wanted and log == []
+    assert found.exclusions == ((DOUBT,) if unordered else ())
+
+
+@pytest.fixture(scope="module")
+def made(ramp_scan, tmp_path_factory):
+    """Job, results, poses and the result of a run that has not been written."""
+    job = ramp_scan.job(tmp_path_factory.mktemp("w"))
+    worker = FrameWorker(job)
+    results = [worker(frame) for frame in find_captures(ramp_scan.root / "images", True).frames]
+    clouds = clouds_of(results)
+    registration = register(clouds)
+    poses = find_scan_poses(clouds, registration, adjust_registered(clouds, registration, SHORT), None, None)
+    config = ramp_scan.config(tmp_path_factory.mktemp("s"))
+    return job, results, poses, summarise(config, "ramps", results, registration, poses)
+
+
+def test_what_is_written_is_what_was_found(made, tmp_path):
+    job, results, poses, _ = made
+    previews = []
+    with NewFolder(tmp_path / "s") as folder:
+        write_scan(folder, *made, lambda _, shown: previews.extend(shown) or "page")
+    assert check_scan(tmp_path / "s") == []
+    scan = read_scan(tmp_path / "s")
+    assert (scan.projector, scan.units, scan.scale) == (job.projector, "arbitrary", poses.scale)
+    np.testing.assert_allclose(scan.poses.T_world_camera, poses.adjusted.poses.T_world_camera, atol=1e-12)
+    np.testing.assert_allclose(scan.poses.T_world_projector, poses.adjusted.poses.T_world_projector, atol=1e-12)
+    worker = FrameWorker(job)
+    for frame, stage, sigma in zip(scan.frames, results, poses.adjusted.sigma, strict=True):
+        decoded = worker.load(stage)
+        assert frame.name == stage.name and frame.camera == job.camera and frame.pose_sigma == sigma
+        np.testing.assert_array_equal(frame.read_image(), read_image(stage.frame.images[0]))
+        np.testing.assert_array_equal(frame.read_coords(), stage.cloud.coords)
+        np.testing.assert_array_equal(frame.read_mask(), decoded.mask)
+        np.testing.assert_allclose(frame.read_pattern(), decoded.pattern, atol=0.51 / 255)
+    assert (tmp_path / "s" / "pattern.json").read_bytes() == LAYOUT.encode()
+    assert (tmp_path / "s" / "processing.html").read_text() == "page"
+    assert len(previews) == 4 and all(p.image is not None and p.coords is not None for p in previews)
+
+
+def test_frames_that_are_not_in_the_scan_are_only_shown(made, tmp_path):
+    job, results, poses, result = made
+    lost = replace(result.frames[1], in_scan=False, stage="registering", reason="alone")
+    failed = replace(results[3], cloud=None, stage="calibrating", reason="flat")
+    some = replace(result, frames=(result.frames[0], lost, result.frames[2], replace(lost, name=NAMES[3])))
+    previews = []
+    with NewFolder(tmp_path / "s") as folder:
+        write_scan(folder, job, [*results[:3], failed], poses, some, lambda _, p: previews.extend(p) or "")
+    scan = read_scan(tmp_path / "s")
+    assert [frame.name for frame in scan.frames] == [NAMES[0], NAMES[2]]
+    np.testing.assert_allclose(scan.poses.T_world_camera, poses.adjusted.poses.T_world_camera[[0, 2]], atol=1e-12)
+    assert [preview.coords is None for preview in previews] == [False, False, False, True]
+    assert all(preview.image is not None for preview in previews)
+
+
+def test_nothing_is_left_if_writing_fails(made, tmp_path):
+    job, results, poses, result = made
+    away = replace(job, work=tmp_path / "other")
+    with (
+        pytest.raises(UserError, match=f"the decoded frame {NAMES[0]} is missing"),
+        NewFolder(tmp_path / "s") as folder,
+    ):
+        write_scan(folder, away, results, poses, result, lambda *_: "")
+    assert not (tmp_path / "s").exists()

@@ -1,10 +1,11 @@
-"""One frame decoded again, with everything known by formula."""
+"""What a surface predicts, and one frame decoded again, with everything known by formula."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.redecoding.measure import Ambiguity
 from sl_nerfstudio.redecoding.redecode import PredictedSurface, redecode_frame
 from tests.redecoding.lit_ball import (
@@ -15,16 +16,60 @@ from tests.redecoding.lit_ball import (
     ball,
     grid,
     picture,
+    seen_at,
     truth,
     with_holes,
 )
-
-MASK = np.isfinite(truth()).all(-1)
 
 
 @pytest.fixture(scope="module")
 def predicted():
     return PredictedSurface(ball()).predict(CAMERA, PROJECTOR, T_CAMERA, T_PROJECTOR)
+
+
+def test_coordinates_are_those_of_the_ball(predicted):
+    both = predicted.known & np.isfinite(truth()).all(-1)
+    assert (predicted.known != np.isfinite(truth()).all(-1)).mean() < 0.01  # the mesh's outline has corners
+    error = np.linalg.norm(predicted.coords - truth(), axis=-1)[both]
+    assert np.median(error) < 0.05 and np.quantile(error, 0.99) < 1  # large only where rays graze the facets
+
+
+def test_a_point_that_moves_along_its_ray_moves_its_coordinate_along_the_stated_direction(predicted):
+    row, column = 70, 84
+    seen = seen_at(np.array([column + 0.5]), np.array([row + 0.5]))
+    ray = seen.p_world[0] - T_CAMERA[:3, 3]
+    moved = seen.p_world[0] + 0.01 * ray
+    q = (moved - T_PROJECTOR[:3, 3]) @ T_PROJECTOR[:3, :3]
+    uv = np.array([PROJECTOR.fl_x * q[0] / -q[2] + PROJECTOR.cx, -PROJECTOR.fl_y * q[1] / -q[2] + PROJECTOR.cy])
+    way = uv - seen.coords[0]
+    np.testing.assert_allclose(predicted.along[row, column], way / np.linalg.norm(way), atol=2e-3)
+    assert predicted.depth[row, column] * CAMERA.fl_x == pytest.approx(np.linalg.norm(ray), abs=0.05)
+
+
+def test_there_is_no_prediction_in_the_shadow_of_something_else():
+    way = T_PROJECTOR[:3, 3] / np.linalg.norm(T_PROJECTOR[:3, 3])
+    side = np.cross(way, [0.0, 0, 1])
+    corners = 150 * way + 20 * np.array([side, [0, 0, 1], -side, [0, 0, -1.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]]) + len(ball().vertices)
+    shaded = Mesh(np.concatenate([ball().vertices, corners]), np.concatenate([ball().faces, faces]))
+    found = PredictedSurface(shaded).predict(CAMERA, PROJECTOR, T_CAMERA, T_PROJECTOR)
+    light = np.abs(truth() - 200).max(-1)  # the plate is about the middle of the light
+    assert not found.known[light < 60].any() and found.known[(light > 155) & (light < 170)].mean() > 0.9
+
+
+def test_a_far_away_origin_changes_nothing(predicted):
+    shift = np.array([1e5, -2e5, 3e5])
+    T_camera, T_projector = T_CAMERA.copy(), T_PROJECTOR.copy()
+    T_camera[:3, 3] += shift
+    T_projector[:3, 3] += shift
+    moved = Mesh(ball().vertices + shift, ball().faces)
+    found = PredictedSurface(moved).predict(CAMERA, PROJECTOR, T_camera, T_projector)
+    same = found.known & predicted.known
+    assert (found.known == predicted.known).mean() > 0.999
+    np.testing.assert_allclose(found.coords[same], predicted.coords[same], atol=0.02)
+
+
+MASK = np.isfinite(truth()).all(-1)
 
 
 def again(decoded, predicted, image=None, mask=MASK):
@@ -36,10 +81,12 @@ def error(coords):
     return np.linalg.norm(coords - truth(), axis=-1)
 
 
-@pytest.mark.parametrize("share", [0.6, 0.9])
-def test_cells_that_were_removed_come_back(predicted, share):
+@pytest.mark.parametrize(("share", "mask"), [(0.6, MASK), (0.9, MASK), (0.6, None)])
+def test_cells_that_were_removed_come_back(predicted, share, mask):
+    """Without a mask, the image itself tells where the pattern is."""
     decoded = with_holes(truth(), share)
-    found, facts = again(decoded, predicted)
+    found, facts = again(decoded, predicted, mask=mask)
+    assert facts.shown == (MASK.size if mask is None else MASK.sum())
     new = np.isfinite(found).all(-1) & ~np.isfinite(decoded).all(-1)
     assert facts.decoded_after > 0.75 * MASK.sum() and facts.added == new.sum()
     assert np.median(error(found)[new]) < 0.05 and error(found)[new].max() < 1
@@ -55,11 +102,6 @@ def test_of_many_decoded_pixels_a_part_is_enough_to_learn_from(predicted, monkey
     found, facts = again(decoded, predicted)
     assert facts.checked < 0.15 * facts.decoded_before and facts.decoded_after > 0.75 * MASK.sum()
     assert np.nanmax(error(found)) < 1
-
-
-def test_without_a_mask_the_image_itself_says_where_the_pattern_is(predicted):
-    found, facts = again(with_holes(truth(), 0.6), predicted, mask=None)
-    assert facts.shown == MASK.size and facts.decoded_after > 0.75 * MASK.sum() and np.nanmax(error(found)) < 1
 
 
 def test_noise_makes_no_wrong_values(predicted):

@@ -9,34 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.cli.redecode import (
-    RedecodeArguments,
-    check,
-    main,
-    redecode_trained,
-)
+from sl_nerfstudio.cli.redecode import RedecodeArguments, check, main, redecode_trained
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.redecoding.redecode import RedecodeSettings, redecode_run
+from sl_nerfstudio.redecoding.redecode import redecode_run
 from sl_nerfstudio.runs.run import TrainedRun
-from sl_nerfstudio.scan import (
-    PoseSigma,
-    Scale,
-    Scan,
-    ScanWriter,
-    check_scan,
-    read_scan,
-)
-from tests.redecoding.lit_ball import (
-    CAMERA,
-    PROJECTOR,
-    RADIUS,
-    T_CAMERA,
-    T_PROJECTOR,
-    grid,
-    picture,
-    truth,
-    with_holes,
-)
+from sl_nerfstudio.scan import PoseSigma, Scale, Scan, ScanWriter, check_scan, read_scan
+from tests.redecoding.lit_ball import CAMERA, PROJECTOR, RADIUS, T_CAMERA, T_PROJECTOR, grid, picture, truth, with_holes
 from tests.runs.ball_run import BallModel, run_of
 
 MASK = np.isfinite(truth()).all(-1)
@@ -88,7 +66,7 @@ def files(root: Path) -> dict[str, bytes]:
 
 def test_the_new_folder_is_the_old_scan_with_more_coordinates(run, scan, tmp_path):
     before, output = files(scan.root), tmp_path / "again"
-    found = redecode_run(run, RedecodeSettings(output, 90))
+    found = redecode_run(run, output, 90)
     after = files(output)
     assert files(scan.root) == before
     assert set(after) == set(before) | {"redecoding.json"}
@@ -122,7 +100,7 @@ def test_nothing_is_overwritten_and_nothing_is_left_behind(run, scan, tmp_path, 
     assert not (tmp_path / "new").exists()
     monkeypatch.setattr("sl_nerfstudio.redecoding.redecode._copy_others", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        redecode_run(run, RedecodeSettings(tmp_path / "new", 60))
+        redecode_run(run, tmp_path / "new", 60)
     assert not (tmp_path / "new").exists()
 
 

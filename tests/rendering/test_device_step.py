@@ -13,22 +13,10 @@ from sl_nerfstudio.field.field import CachedGrid
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.lie import exp_se3, inverse, transform
 from sl_nerfstudio.geometry.triangulation import pixel_rays
-from sl_nerfstudio.rendering.direct_losses import (
-    DecodingNoise,
-    MeasuredRays,
-    direct_losses,
-    field_losses,
-)
-from sl_nerfstudio.rendering.losses import LossConfig, SamplingConfig, coordinate_loss, pattern_loss
-from sl_nerfstudio.rendering.renderer import Renderer
-from sl_nerfstudio.rendering.warp_step import (
-    Current,
-    Devices,
-    Pixels,
-    Step,
-    StepLosses,
-    step_losses,
-)
+from sl_nerfstudio.rendering.direct_losses import DecodingNoise, MeasuredRays, direct_losses, field_losses
+from sl_nerfstudio.rendering.losses import LossConfig, coordinate_loss, pattern_loss
+from sl_nerfstudio.rendering.renderer import Renderer, SamplingConfig
+from sl_nerfstudio.rendering.warp_step import Current, Devices, Pixels, Step, StepLosses, step_losses
 
 PINHOLE = Device(64, 48, 80.0, 82.0, 32.0, 24.0)
 PROJECTORS = {
@@ -175,7 +163,7 @@ class Settings:
 
 
 def sampling(strategy: str) -> SamplingConfig:
-    return SamplingConfig(strategy, samples=SAMPLES, render_rays=RENDERED, eikonal_points=OTHERS)
+    return SamplingConfig(strategy=strategy, samples=SAMPLES, render_rays=RENDERED, eikonal_points=OTHERS)
 
 
 PAPER = LossConfig(coordinates=0.0, coordinates_per_pixel=0.02, pattern=0.05, eikonal=0.01, surface=0.0, free_space=0.0)

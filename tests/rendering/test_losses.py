@@ -1,14 +1,19 @@
-"""Values computed by hand, invariances, and insensitivity to gross errors."""
+"""Losses by hand, invariances, insensitivity to gross errors; sharpness and levels over a run."""
+
+from itertools import pairwise
 
 import pytest
 import torch
 
 from sl_nerfstudio.rendering.losses import (
+    AnnealingConfig,
     behind_loss,
     coordinate_loss,
     eikonal_loss,
     facing_loss,
     free_space_loss,
+    kappa_at,
+    level_weights_at,
     pattern_loss,
     surface_loss,
 )
@@ -49,7 +54,12 @@ def test_slope_one_costs_nothing():
     gradient = torch.nn.functional.normalize(torch.randn(50, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     assert float(eikonal_loss(gradient, ALL)) < 1e-12
     assert float(eikonal_loss(3 * gradient, ALL)) == pytest.approx(4, rel=1e-5)
-    assert float(eikonal_loss(0.5 * gradient, ALL)) == pytest.approx(0.25, rel=1e-5)
+    counts = ALL.clone()
+    counts[25:] = False  # points that do not count are as if they were not there
+    assert float(eikonal_loss(torch.cat([0.5 * gradient[:25], 9 * gradient[25:]]), counts)) == pytest.approx(
+        0.25, rel=1e-5
+    )
+    assert eikonal_loss(gradient, ~ALL) == 0
 
 
 def test_measured_points_attract_the_surface_when_near_and_not_when_far():
@@ -83,16 +93,10 @@ def test_signs_in_front_of_the_surface_and_behind():
     assert float(free_space_loss(sdf, least, counts)) == pytest.approx((0 + 0.1 + 0.3) / 3)
     assert float(behind_loss(sdf, counts)) == pytest.approx(0.6 / 3)
     assert float(behind_loss(-sdf.abs(), counts)) == 0
-
-
-def test_points_that_do_not_count_are_as_if_they_were_not_there():
-    sdf, least = torch.tensor([0.5, 0.1, -0.2]), torch.tensor([0.2, 0.2, 0.1])
-    gradient = torch.tensor([[2.0, 0, 0], [0, 1, 0], [0, 0, 3]])
-    counts = torch.tensor([True, False, True])
-    assert free_space_loss(sdf, least, counts) == free_space_loss(sdf[counts], least[counts], ALL[:2])
-    assert behind_loss(sdf, counts) == behind_loss(sdf[counts], ALL[:2])
-    assert eikonal_loss(gradient, counts) == eikonal_loss(gradient[counts], ALL[:2]) == 2.5
-    assert eikonal_loss(gradient, ~ALL[:3]) == 0
+    counts[1] = False
+    assert (
+        float(free_space_loss(sdf, least, counts)) == pytest.approx(0.3 / 2) and float(behind_loss(sdf, counts)) == 0.25
+    )
 
 
 def test_a_surface_may_be_grazed_but_not_seen_from_inside():
@@ -102,3 +106,41 @@ def test_a_surface_may_be_grazed_but_not_seen_from_inside():
     assert float(facing_loss(gradient, direction, weight)) == pytest.approx((2 * 0.05 + 1.05) / 5)
     assert float(facing_loss(gradient[:2], direction[:2], weight[:2])) == pytest.approx(0, abs=1e-12)
     assert float(facing_loss(gradient, direction, 0 * weight)) == 0
+
+
+TOTAL, LEVELS = 1000, 8
+
+
+@pytest.mark.parametrize(("growth", "half_way", "end"), [("geometric", 12800**0.5, 400), ("linear", 42, 200)])
+def test_sharpness_grows_from_start_to_end(growth, half_way, end):
+    values = [kappa_at(growth, step, TOTAL) for step in range(0, 10 * TOTAL, 10)]
+    assert values[0] == pytest.approx(32) and values[-1] == max(values) == pytest.approx(end)
+    assert all(b >= a for a, b in pairwise(values))
+    assert kappa_at(growth, 500, TOTAL) == pytest.approx(half_way)
+
+
+def test_linear_sharpness_does_not_depend_on_the_length_of_the_run_and_constant_on_nothing():
+    assert {kappa_at("linear", 100, total) for total in (1, 100, 10**6)} == {34.0}
+    assert {kappa_at("constant", step, TOTAL) for step in (0, 5, 3 * TOTAL)} == {400.0}
+
+
+def test_levels_fade_in_one_after_the_other():
+    table = torch.stack([level_weights_at(AnnealingConfig(), LEVELS, step, TOTAL) for step in range(0, 600, 5)])
+    assert torch.equal(table[0], torch.tensor([1.0, 1.0] + [0.0] * 6))
+    assert torch.equal(table[80:], torch.ones_like(table[80:]))  # step 400 and after
+    assert not torch.equal(table[79], torch.ones(LEVELS))
+    assert (table.diff(dim=0) >= 0).all() and (table.diff(dim=1) <= 0).all()
+    assert table.min() >= 0 and table.max() <= 1
+    assert ((table > 0) & (table < 1)).sum(1).max() == 1  # one at a time
+
+
+@pytest.mark.parametrize(
+    "config, levels, step, total",
+    [
+        (AnnealingConfig(coarse_to_fine=False), LEVELS, 0, TOTAL),
+        (AnnealingConfig(), 2, 0, TOTAL),
+        (AnnealingConfig(), LEVELS, 1, 0),
+    ],
+)
+def test_all_levels_at_once(config, levels, step, total):
+    assert torch.equal(level_weights_at(config, levels, step, total), torch.ones(levels))

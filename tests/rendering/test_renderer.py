@@ -10,8 +10,7 @@ from torch import Tensor
 from sl_nerfstudio.field.field import CachedGrid
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.lie import inverse, transform
-from sl_nerfstudio.rendering.losses import SamplingConfig
-from sl_nerfstudio.rendering.renderer import Renderer
+from sl_nerfstudio.rendering.renderer import Renderer, SamplingConfig
 from tests.meshing.ray_cast_scan import look_at
 
 BALLS = torch.tensor([[0.0, 0.0, 0.0, 0.4], [0.45, 0.0, 0.5, 0.15]])  # centre and radius: the second shades the first

@@ -1,13 +1,91 @@
-"""Volume rendering against its formula, against ray casting, and what is lit."""
+"""Where rays are sampled, and volume rendering: against its formula, ray casting, and in compiled loops."""
 
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import map_coordinates
+from torch import Tensor
 
+from sl_nerfstudio.field.field import CachedGrid
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.lie import inverse, transform
-from sl_nerfstudio.rendering.volume_rendering import interval_weights, look_up, render
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, transform
+from sl_nerfstudio.rendering.volume_rendering import (
+    Rendered,
+    comes_below,
+    first_crossing,
+    first_crossings,
+    interval_weights,
+    look_up,
+    render,
+    sphere_interval,
+    uniform_samples,
+)
+
+
+def random_rays(count: int = 400) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    o = 3 * torch.randn(count, 3, generator=generator, dtype=torch.float64)
+    d = torch.randn(count, 3, generator=generator, dtype=torch.float64) - 0.7 * o
+    return o, d / d.norm(dim=-1, keepdim=True)
+
+
+@pytest.mark.parametrize("radius", [1.0, 2.5])
+def test_intervals_end_on_the_sphere(radius):
+    o, d = random_rays()
+    near, far, meets = sphere_interval(o, d, radius)
+    nearest = -(o * d).sum(-1)
+    miss = (o + nearest[:, None] * d).norm(dim=-1)
+    inside = o.norm(dim=-1) < radius
+    assert torch.equal(meets, inside | ((miss < radius) & (nearest > 0)))
+    full = meets & (miss < radius * 0.75**0.5)  # chords at least as long as the radius
+    assert full.sum() > 50 and (full & inside).any() and (meets & ~full).any() and (~meets).any()
+    entry, leave = (o + near[:, None] * d).norm(dim=-1), (o + far[:, None] * d).norm(dim=-1)
+    assert torch.allclose(leave[full], torch.full_like(leave[full], radius))
+    assert torch.allclose(entry[full & ~inside], torch.full_like(entry[full & ~inside], radius))
+    assert torch.equal(near[inside], torch.zeros_like(near[inside]))
+    short = ~full & (nearest > radius / 2)
+    assert torch.allclose((far - near)[short], torch.full_like(near[short], radius))
+    assert torch.allclose((far + near)[short] / 2, nearest[short])
+    assert (near >= 0).all() and (far > near).logical_or(~meets).all()
+
+
+def test_samples_are_ascending_one_in_each_stratum():
+    near, far = torch.tensor([1.0, 0.0]), torch.tensor([3.0, 0.5])
+    middles = uniform_samples(near, far, 4, jitter=False)
+    assert torch.allclose(middles, torch.tensor([[1.25, 1.75, 2.25, 2.75], [0.0625, 0.1875, 0.3125, 0.4375]]))
+    torch.manual_seed(0)
+    jittered = uniform_samples(near.expand(2), far, 50, jitter=True)
+    stratum = ((jittered - near[:, None]) / (far - near)[:, None] * 50).floor()
+    assert ((stratum - torch.arange(50)).abs() <= 1e-4).float().mean() > 0.97  # the rest: rounding at a border
+    assert (jittered.diff(dim=-1) > 0).all()
+
+
+def test_the_crossing_of_a_plane_is_exact():
+    o, d = random_rays(50)
+    normal = torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
+    t_true = (0.2 - o @ normal) / (d @ normal)
+    near, far = torch.zeros(50, dtype=torch.float64), torch.full((50,), 20.0, dtype=torch.float64)
+    t, found = first_crossing(lambda p: p @ normal - 0.2, o, d, near, far, 64)
+    step = 20 / 64
+    clear = (t_true > step / 2) & (t_true < 20 - step / 2)  # between the first and the last sample
+    expected = clear & (d @ normal < 0)
+    assert expected.sum() > 5 and torch.equal(found, expected)
+    assert torch.allclose(t[found], t_true[found], atol=1e-9)
+
+
+def test_the_first_of_two_balls_is_found_and_leaving_one_does_not_count():
+    centres = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
+
+    def sdf(p: torch.Tensor) -> torch.Tensor:
+        return (p[:, None] - centres).norm(dim=-1).min(-1).values - 0.4
+
+    o = torch.tensor([[0.0, 0.0, 3.0], [0.0, 0.0, 1.0], [0.0, 0.0, 3.0], [5.0, 0.0, 3.0]], dtype=torch.float64)
+    d = torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=torch.float64)
+    near, far = torch.zeros(4, dtype=torch.float64), torch.full((4,), 6.0, dtype=torch.float64)
+    t, found = first_crossing(sdf, o, d, near, far, 61)
+    assert found.tolist() == [True, True, False, False] and t.isfinite().all()
+    assert torch.allclose(t[:2], torch.tensor([1.6, 1.6], dtype=torch.float64), atol=1e-9)  # out of one, into the next
+
 
 PROJECTOR = Intrinsics.of(Device(64, 48, 100.0, 100.0, 32.0, 24.0), torch.float64)
 RADIUS = 0.5
@@ -47,12 +125,6 @@ def test_an_infinitely_sharp_wall_is_one_interval():
     assert torch.equal(interval_weights(f, 1e4), torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]))
     outside = interval_weights(f.abs() + 1, 1e4)
     assert outside.sum() == 0
-
-
-def test_weights_are_differentiable():
-    f = random_sdf(3, 6).requires_grad_()
-    kappa = torch.tensor(7.0, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(interval_weights, (f, kappa))
 
 
 def camera_rays() -> tuple[torch.Tensor, torch.Tensor]:
@@ -151,3 +223,68 @@ def test_the_pattern_between_pixels_equals_scipys():
     assert torch.equal(look_up(pattern, uv.reshape(5, 100, 2)), look_up(pattern, uv).reshape(5, 100))
     centre = torch.tensor([[0.5, 0.5], [10.5, 6.5]], dtype=torch.float64)
     assert torch.allclose(look_up(pattern, centre), torch.stack([pattern[0, 0], pattern[6, 10]]))
+
+
+RAYS = 300
+
+
+def unit(count: int) -> Tensor:
+    return torch.nn.functional.normalize(torch.randn(count, 3, dtype=torch.float64), dim=-1)
+
+
+def values(rendered: Rendered) -> list[Tensor]:
+    return [value.detach() for value in vars(rendered).values()]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize(
+    "projector",
+    [
+        Device(64, 48, 40.0, 44.0, 32.0, 24.0),
+        Device(64, 48, 40.0, 44.0, 30.0, 25.0, k1=-0.3, k2=0.05, p1=0.01, p2=-0.02),
+        Device(64, 48, 60.0, 60.0, 32.0, 24.0, model="DOE"),
+    ],
+)
+def test_rays_are_rendered_as_with_gradients(projector, dtype):
+    """Through surfaces, beside them and behind the projector, in and outside the pattern, before its lens folds."""
+    torch.manual_seed(0)
+    t = torch.rand(RAYS, 17, dtype=torch.float64).sort().values * 3
+    sdf = torch.randn(RAYS, 17, dtype=torch.float64) * 0.3 + 0.2
+    sdf[:20] = sdf[:20].abs() + 1  # these meet nothing
+    T = exp_se3(torch.randn(RAYS, 6, dtype=torch.float64))
+    arguments = [x.to(dtype) for x in (sdf, t, torch.randn(RAYS, 3), unit(RAYS), T)]
+    pattern = torch.rand(48, 64).to(dtype)
+    intrinsics = Intrinsics.of(projector, dtype)
+    with torch.enable_grad():
+        wanted = render(*arguments, intrinsics, pattern, 30.0)
+    with torch.no_grad():
+        found = render(*arguments, intrinsics, pattern, torch.tensor(30.0))
+    assert 0.1 < float((wanted.lit > 0.5).float().mean()) < 0.9
+    tolerance = 1e-10 if dtype == torch.float64 else 3e-4
+    for one, other in zip(values(found), values(wanted), strict=True):
+        assert one.dtype == dtype and one.shape == other.shape
+        torch.testing.assert_close(one, other, rtol=tolerance, atol=tolerance)
+
+
+def test_rays_come_below_a_limit_where_the_least_of_their_samples_is_below():
+    torch.manual_seed(1)
+    cache = CachedGrid(9)
+    cache.values.copy_(torch.randn(9, 9, 9))
+    o, d = torch.randn(RAYS, 3), unit(RAYS).float()  # many leave the box
+    near, far = torch.rand(RAYS), 1 + torch.rand(RAYS)
+    t = uniform_samples(near, far, 11, jitter=False)
+    least = cache.look_up((o[:, None] + t[..., None] * d[:, None]).reshape(-1, 3)).reshape(t.shape).amin(-1)
+    off = torch.where(torch.arange(RAYS) % 2 == 0, 1e-4, -1e-4)
+    assert torch.equal(comes_below(cache.values, o, d, near, far, 11, least + off), off > 0)
+
+
+def test_crossings_are_those_of_the_samples():
+    torch.manual_seed(2)
+    cache = CachedGrid(9)
+    cache.values.copy_(torch.randn(9, 9, 9))
+    o, d = torch.rand(RAYS, 3) - 0.5, unit(RAYS).float()
+    near, far = torch.zeros(RAYS), 1 + torch.rand(RAYS)
+    t, found = first_crossings(cache.values, o, d, near, far, 13)
+    wanted_t, wanted = first_crossing(cache.look_up, o, d, near, far, 13)
+    assert torch.equal(found, wanted) and 0.1 < float(found.float().mean()) < 0.95
+    torch.testing.assert_close(t, wanted_t, rtol=1e-4, atol=1e-4)

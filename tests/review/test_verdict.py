@@ -10,7 +10,7 @@ from tests.review.cases import ring
 
 N = 12
 NAMES = [f"f{k:02d}" for k in range(N)]
-GOOD = tuple(FrameFacts(name, sigma_rotation_deg=0.1, decoded_share=0.9, own_share=0.95) for name in NAMES)
+GOOD = tuple(FrameFacts(name, sigma_rotation_deg=0.1, decode_rate=0.9, own_share=0.95) for name in NAMES)
 CHAIN = tuple(PairFacts((NAMES[k], NAMES[(k + gap) % N]), True) for gap in (1, 2) for k in range(N))
 
 
@@ -25,7 +25,7 @@ def test_a_scan_without_any_doubt_is_good():
     verdict = judge_scan(scan())
     assert verdict.band == "good" and verdict.reasons == ()
     assert judge_scan(ScanFacts(GOOD)).band == "good"  # what is not known is not judged
-    background = {k: {"decoded_share": 0.2, "shared_decoded": 0.8} for k in range(N)}  # that no frame decodes
+    background = {k: {"decode_rate": 0.2, "shared_decoded": 0.8} for k in range(N)}  # that no frame decodes
     assert judge_scan(scan(background)).band == "good"
 
 
@@ -34,9 +34,9 @@ def test_a_scan_without_any_doubt_is_good():
     [
         ({"undecided": True}, "the pose is undecided"),
         ({"sigma_rotation_deg": 5.0}, "to 5 degrees"),
-        ({"decoded_share": 0.2}, "only 20% of the visible pattern"),
-        ({"decoded_share": 0.9, "shared_decoded": 0.3}, "only 30% of the surface that other frames show"),
-        ({"decoded_share": 0.0}, "only 0% of the visible pattern"),
+        ({"decode_rate": 0.2}, "only 20% of the visible pattern"),
+        ({"decode_rate": 0.9, "shared_decoded": 0.3}, "only 30% of the surface that other frames show"),
+        ({"decode_rate": 0.0}, "only 0% of the visible pattern"),
         ({"missing_share": 0.07}, "saw nothing of the pattern"),
         ({"missing_share": 0.2}, "(20% of it in the worst of them; at most 5%)"),
         ({"own_share": 0.1}, "only 10% of the decoded pixels"),
@@ -129,8 +129,8 @@ def test_too_few_frames_wrong_intrinsics_and_weak_poses():
     lost = {k: {"in_scan": False} for k in range(1, N)}
     assert judge_scan(scan(lost)).reasons == ("only 1 of 12 frames could be used",)
     assert judge_scan(scan(wrong_intrinsics=True)).band == "acceptable"
-    assert judge_scan(scan({0: {"degenerate": True}})).band == "good"  # the other frames determine it
-    assert judge_scan(scan({k: {"degenerate": True} for k in range(5)})).band == "acceptable"
+    assert judge_scan(scan({0: {"degeneracies": ("flat",)}})).band == "good"  # the other frames determine it
+    assert judge_scan(scan({k: {"degeneracies": ("flat",)} for k in range(5)})).band == "acceptable"
 
 
 def test_the_worst_reason_comes_first():

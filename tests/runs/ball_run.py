@@ -27,6 +27,8 @@ class BallModel:
     sigma: np.ndarray | None = None
     S_scene_world: Similarity = S_SCENE_WORLD
     cell: float = 1.0
+    step: int = 10
+    viewed_frame: int = 0
     last_unplaced: bool = False
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
 
@@ -36,6 +38,10 @@ class BallModel:
 
     def poses(self):
         return self.scan.poses
+
+    def poses_scene(self):
+        p = self.scan.poses.mapped(self.S_scene_world)
+        return torch.from_numpy(p.T_world_camera), torch.from_numpy(p.T_world_projector)
 
     def pose_sigma(self):
         return self.sigma

@@ -1,20 +1,16 @@
 """What an export hands back and writes, for a ball whose field and poses are known by formula."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.meshing.files import read_mesh
-from sl_nerfstudio.runs.export import export_run, training_record
+from sl_nerfstudio.runs.export import COVARIANCE, export_run, read_covariance, training_record, write_covariance
 from sl_nerfstudio.runs.export_settings import ExportSettings
-from sl_nerfstudio.scan import (
-    PoseSigma,
-    Scan,
-    read_pose_sigmas,
-    read_poses,
-    read_unplaced,
-)
+from sl_nerfstudio.scan import FileError, PoseSigma, Scan, read_pose_sigmas, read_poses, read_unplaced
 
 from .ball_run import CENTRE, RADIUS, ball_scan, run_of
 
@@ -63,17 +59,37 @@ def test_poses_without_an_estimated_uncertainty_state_none(scan: Scan, tmp_path)
     assert read_pose_sigmas(tmp_path / "transforms.json", scan) == [None] * 6
 
 
-def test_the_area_of_the_trimmed_surface_does_not_depend_on_the_resolution(scan: Scan, tmp_path):
-    areas = [
-        export_run(run_of(scan), ExportSettings(tmp_path / f"{n}.ply", resolution=n)).mesh.face_areas().sum()
-        for n in (64, 96)
-    ]
-    assert areas[0] == pytest.approx(areas[1], rel=0.03)
-
-
 def test_a_frame_that_cannot_be_placed_is_marked_and_states_no_uncertainty(scan: Scan, tmp_path):
     run = run_of(scan, np.ones((6, 4)))
     run.model.last_unplaced = True
     export_run(run, ExportSettings(tmp_path / "mesh.ply", tmp_path, resolution=32))
     assert read_unplaced(tmp_path / "transforms.json", scan) == [scan.frames[-1].name]
     assert [s is None for s in read_pose_sigmas(tmp_path / "transforms.json", scan)] == [False] * 5 + [True]
+
+
+def test_what_was_written_is_read_and_a_run_without_it_removes_it(scan: Scan, tmp_path):
+    factor = np.random.default_rng(0).normal(size=(78, 50))
+    write_covariance(tmp_path, scan, JointCovariance(factor))
+    found = read_covariance(tmp_path, scan)
+    assert found is not None and np.array_equal(found.factor, factor) and found.frames == 6
+    write_covariance(tmp_path, scan, None)
+    assert read_covariance(tmp_path, scan) is None and list(tmp_path.iterdir()) == []
+    write_covariance(tmp_path, scan, None)
+
+
+def test_files_of_other_scans_and_damaged_ones_are_refused(scan: Scan, tmp_path):
+    joint = JointCovariance(np.eye(78))
+    write_covariance(tmp_path, scan, joint)
+    for other in (replace(scan, units="cm"), replace(scan, frames=scan.frames[:5])):
+        with pytest.raises(FileError, match=r"is that of other frames or another unit\n    cause:"):
+            read_covariance(tmp_path, other)
+    content = (tmp_path / COVARIANCE).read_bytes()
+    (tmp_path / COVARIANCE).write_bytes(content[: len(content) // 2])
+    with pytest.raises(FileError, match="cannot be read"):
+        read_covariance(tmp_path, scan)
+    write_covariance(tmp_path, scan, JointCovariance(np.eye(66)))
+    with pytest.raises(FileError, match=r"factor: is float64 \(66, 66\)"):
+        read_covariance(tmp_path, scan)
+    np.savez(tmp_path / COVARIANCE, something=np.eye(3))
+    with pytest.raises(FileError, match="cannot be read"):
+        read_covariance(tmp_path, scan)

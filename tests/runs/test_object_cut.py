@@ -1,6 +1,5 @@
 """The object cut out of a mesh: a ball on a table, from noise-free captures."""
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -9,13 +8,11 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.cli.export import ExportConfig, summary
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.meshing.finish import MarkedMesh
-from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties, VertexQuality
+from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.object_separation.separate import Separation
-from sl_nerfstudio.runs.export import Exported, ExtractedSurface, build_surface, cut_object, planes_below, separate_scan
+from sl_nerfstudio.runs.export import build_surface, cut_object, planes_below, separate_scan
 from sl_nerfstudio.runs.export_settings import ExportSettings
 from sl_nerfstudio.scan import Scan
 from tests.meshing.ray_cast_scan import pairs_around, scan_of
@@ -23,7 +20,6 @@ from tests.meshing.ray_cast_scan import pairs_around, scan_of
 from .ball_run import BallModel
 
 RADIUS = 25.0
-NO_QUALITY = VertexQuality(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0))
 
 
 def _mesh(*parts: trimesh.Trimesh) -> Mesh:
@@ -101,19 +97,6 @@ def test_a_closed_solid_of_the_object_alone_stands_flat_where_the_table_was(scan
     assert bottom > -RADIUS and (mesh.vertices[:, 2] < bottom + 0.05).sum() > 20  # flat
     open_one = build_surface(model, ExportSettings(Path("m.ply"), resolution=64, object_only=True))
     assert not open_one.marked.mesh.is_closed() and len(open_one.marked.mesh.faces) < len(mesh.faces)
-
-
-def test_the_summary_says_what_was_removed_and_why(scan, found):
-    mesh = _mesh(BALL, TABLE)
-    cut = cut_object(mesh, found)
-    marked = MarkedMesh(mesh, np.zeros(len(mesh.vertices), dtype=bool)).with_faces(cut.kept)
-    surface = ExtractedSurface(marked, None, None, cut, 0, 1.0)
-    exported = Exported(
-        marked.mesh, VertexProperties(NO_QUALITY, marked.invented), surface, *3 * [None], 0, None, False, 1.0
-    )
-    text = " ".join(summary(ExportConfig(Path("c"), Path("mesh.ply"), object_only=True), scan, exported).split())
-    assert re.search(r"--object-only removed [\d.e+]+ square mm \(9\d% of the surface\) with 1 planes around", text)
-    assert "of the points left out: all cameras are in front of it, nothing is behind it" in text
 
 
 def test_a_surface_elsewhere_leaves_nothing(found):

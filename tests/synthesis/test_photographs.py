@@ -12,15 +12,9 @@ from sl_nerfstudio.scan.check import check_scan
 from sl_nerfstudio.scan.images import as_grey, read_image
 from sl_nerfstudio.synthesis.appearance import HARD, REALISTIC
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.devices import disturb_image, pixels
-from sl_nerfstudio.synthesis.photograph import (
-    Shot,
-    choose_useless,
-    plan_shots,
-    turn_away,
-)
-from sl_nerfstudio.synthesis.render import render_capture
-from sl_nerfstudio.synthesis.synthesise import Stream, make_setup, synthesise
+from sl_nerfstudio.synthesis.devices import pixels
+from sl_nerfstudio.synthesis.photograph import Shot, choose_useless, plan_shots, turn_away
+from sl_nerfstudio.synthesis.synthesise import make_setup, synthesise
 
 _CONFIG = SynthConfig(frames=8, resolution=90, seed=6, images_only=True, supersampling=1)
 
@@ -38,6 +32,7 @@ def _usable(root):
     return [frame["usable"] for frame in json.loads((root / "ground_truth/captures.json").read_text())["frames"]]
 
 
+@pytest.mark.slow
 def test_photographs_are_jpegs_in_colour_that_the_truth_shows_too(captures):
     for appearance in ("realistic", "hard"):
         files = sorted((captures / appearance / "images").iterdir())
@@ -50,6 +45,7 @@ def test_photographs_are_jpegs_in_colour_that_the_truth_shows_too(captures):
         assert np.abs(image[..., 0].astype(int) - image[..., 2]).max() > 3, "grey"
 
 
+@pytest.mark.slow
 def test_the_truth_is_that_of_the_plain_scan_except_where_a_frame_looks_away(captures):
     plain = read_scan(captures / "plain/ground_truth")
     assert _usable(captures / "plain") == [True] * 8
@@ -64,6 +60,7 @@ def test_the_truth_is_that_of_the_plain_scan_except_where_a_frame_looks_away(cap
         assert away <= sum(not usable for usable in _usable(captures / appearance))
 
 
+@pytest.mark.slow
 def test_the_pattern_is_where_the_coordinates_say(captures):
     """The pattern, looked up at the coordinates, explains the local contrast of the usable images."""
     pattern = cv2.GaussianBlur(as_grey(read_image(captures / "realistic/pattern.png")), (0, 0), 3.0)
@@ -82,6 +79,7 @@ def test_the_pattern_is_where_the_coordinates_say(captures):
     assert np.median(agreement) > 0.5 and min(agreement) > 0.15
 
 
+@pytest.mark.slow
 def test_same_flags_same_bytes_and_another_seed_another_look(tmp_path, captures):
     config = replace(_CONFIG, appearance="realistic", background="table", frames=8)
     synthesise(config, tmp_path / "again")
@@ -91,21 +89,6 @@ def test_same_flags_same_bytes_and_another_seed_another_look(tmp_path, captures)
     looks = [make_setup(replace(config, seed=seed, frames=2)).photography.look for seed in (6, 7)]
     assert looks[0].gamma != looks[1].gamma and looks[0].lens != looks[1].lens
     assert not np.array_equal(looks[0].material.base, looks[1].material.base)
-
-
-def test_plain_captures_are_those_of_the_first_version(tmp_path):
-    """Streams 1 to 5 of the seed, and the same light: nothing else has entered the images."""
-    assert [s.value for s in Stream][:6] == [1, 2, 3, 4, 5, 6]
-    config = SynthConfig(frames=3, resolution=60, seed=9)
-    setup = make_setup(config)
-    assert setup.photography is None and setup.surroundings is None
-    assert np.array_equal(setup.caster.scene.vertices, setup.scene.vertices)
-    at = setup.truth.T_world_camera[1], setup.truth.T_world_projector[1]
-    direct = render_capture(setup.caster, setup.devices, *at, setup.pattern, setup.appearance, 2)
-    assert np.array_equal(direct.radiance, setup.render(1, 2).radiance)
-    image = disturb_image(direct.radiance, 1.05, config.sensor_noise, np.random.default_rng([9, 5, 1]))
-    synthesise(replace(config, images_only=True), tmp_path / "captures")
-    assert np.array_equal(read_image(tmp_path / "captures/images/frame_00001.png"), image)
 
 
 def test_a_scan_of_photographs_is_faultless(tmp_path):

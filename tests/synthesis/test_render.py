@@ -7,7 +7,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
 from sl_nerfstudio.synthesis.devices import DevicePair
-from sl_nerfstudio.synthesis.render import RayCaster, render_capture, visible_points
+from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, render_capture, visible_points
 from sl_nerfstudio.synthesis.sdf import Scene
 
 CAMERA = Device(64, 48, 100.0, 100.0, 32.0, 24.0)
@@ -62,7 +62,7 @@ def test_correspondences_of_a_plane_are_exact_and_end_in_the_shadow():
     scene = scene_of(square(80.0, 0.0), square(10.0, 40.0))
     x, y = np.meshgrid(np.arange(CAMERA.w) + 0.5, np.arange(CAMERA.h) + 0.5)
     uv = np.stack([x, y], -1).reshape(-1, 2)
-    seen = visible_points(RayCaster(scene), DEVICES, T_CAMERA, T_PROJECTOR, uv)
+    seen = visible_points(FrameGeometry(RayCaster(scene), DEVICES, T_CAMERA, T_PROJECTOR), uv)
     p = seen.p_world
     on_plane = np.isclose(p[:, 2], 0, atol=1e-9)
     np.testing.assert_allclose(
@@ -81,7 +81,7 @@ def test_light_follows_the_cosine_and_distance_laws():
     scene = scene_of(square(80.0, 0.0))
     plain = Appearance(300.0, np.zeros((1, 3)), np.zeros(1), albedo_contrast=0.0, corner_loss=0.0, blur=1e-6)
     pattern = np.ones((PROJECTOR.h, PROJECTOR.w), dtype=np.float32)
-    shown = render_capture(RayCaster(scene), DEVICES, T_CAMERA, T_PROJECTOR, pattern, plain, 1)
+    shown = render_capture(FrameGeometry(RayCaster(scene), DEVICES, T_CAMERA, T_PROJECTOR), pattern, plain, 1)
     x = 3.0 * (np.arange(CAMERA.w) + 0.5 - 32)
     for column in (20, 32, 50):
         distance = np.hypot(x[column] - 60, 300)
@@ -98,7 +98,7 @@ def test_the_background_is_where_nothing_is_hit():
     small = scene_of(square(20.0, 0.0))
     look = make_appearance(small, 300.0, np.random.default_rng(0))
     pattern = np.zeros((PROJECTOR.h, PROJECTOR.w), dtype=np.float32)
-    shown = render_capture(RayCaster(small), DEVICES, T_CAMERA, T_PROJECTOR, pattern, look, 1)
+    shown = render_capture(FrameGeometry(RayCaster(small), DEVICES, T_CAMERA, T_PROJECTOR), pattern, look, 1)
     assert shown.radiance[0, 0] == pytest.approx(look.background, rel=1e-5)
     assert not shown.mask[:10].any() and shown.mask[24, 32]
 

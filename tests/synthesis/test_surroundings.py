@@ -8,7 +8,7 @@ from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.images import read_image
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.render import RayCaster, above_the_table, joined, make_surroundings
-from sl_nerfstudio.synthesis.scenes import BUILT_IN, cone_and_cylinder
+from sl_nerfstudio.synthesis.scenes import BUILT_IN
 from sl_nerfstudio.synthesis.synthesise import make_setup, synthesise
 
 SCENES = {name: BUILT_IN[name]() for name in ("cone-and-cylinder", "leaf", "vase")}
@@ -34,10 +34,6 @@ def test_surroundings_stand_beside_the_object_and_below_it(name, seed):
         assert distance > reach
         assert board.bounds[1, 2] < scene.centre[2] + distance * low, "the lowest cameras look over it"
     np.testing.assert_allclose(around.vertex_normals[around.faces[:, 0]], around.face_normals, atol=1e-12)
-
-
-def test_none_is_nothing():
-    assert make_surroundings(cone_and_cylinder(), "none", np.random.default_rng(0)) is None
 
 
 def test_the_object_stays_what_it_is_among_its_surroundings():

@@ -1,4 +1,4 @@
-"""The report of `sl-process`: what happened to every capture, as one HTML file that needs no network."""
+"""The reports of `sl-process` and `sl-calibrate`: what happened to every capture, as HTML that needs no network."""
 
 import math
 import re
@@ -29,7 +29,7 @@ from sl_nerfstudio.review.verdict import DEVICES, Verdict, shortcomings
 # The report of `sl-calibrate`: what was found in every photograph, and how far the result can be trusted.
 
 TITLE = b"<title>Calibration report"
-"""By which an earlier report is known."""
+"""Marks an earlier report."""
 _THUMBNAIL = 360  # pixels
 _ARROW = 0.06  # of the image's width: length of the arrow of the largest usual residual
 
@@ -172,10 +172,18 @@ def render_processing_report(result: ProcessResult, previews: Sequence[Preview])
     """The page as text."""
     found = result.object_only
     shares = {} if found is None else {share.name: share for share in found.frames}
-    rows = [
-        FrameRow(record, *_pictures(preview), shares.get(record.name))
-        for record, preview in zip(result.frames, previews, strict=True)
-    ]
+    rows = []
+    for record, preview in zip(result.frames, previews, strict=True):
+        shown = (preview.image, preview.coords, preview.left_out)
+        image, coords, left_out = ("" if p is None else data_uri(p) for p in shown)
+        rows.append(FrameRow(record, image, coords, left_out, shares.get(record.name)))
+    # The flags on which the scan depends; with others, and at another time, the report is the same byte for byte.
+    flags = {key: value for key, value in vars(result.config).items() if key not in _WITHOUT_EFFECT}
+    figure = ""
+    if result.placed:
+        undecided = [f.name for f in result.frames if f.undecided]
+        missing = [] if result.config.unordered else unconnected_neighbours(result.frames, result.edges)
+        figure = placed_figure(result.placed, undecided, missing, {f.name: k for k, f in enumerate(result.frames)})
     values = {
         "result": result,
         "rows": rows,
@@ -185,21 +193,12 @@ def render_processing_report(result: ProcessResult, previews: Sequence[Preview])
         "object_only": () if found is None else object_sentences(found),
         "charts": _charts(result),
         "overlaps": draw_overlaps(result.frames, result.edges) if result.edges else "",
-        "settings": _settings(result),
-        "figure": _figure(result),
+        "settings": sorted((key, str(value)) for key, value in flags.items() if value is not None),
+        "figure": figure,
         "groups": [len(group.frames) for group in result.placed],
         "plotly": compressed_script() if result.placed else "",
     }
     return page(_TEMPLATE, values, first_line=first_line, linked=_linker([f.name for f in result.frames]))
-
-
-def _figure(result: ProcessResult) -> str:
-    """The 3D view; "" if no frame was calibrated."""
-    if not result.placed:
-        return ""
-    undecided = [f.name for f in result.frames if f.undecided]
-    missing = [] if result.config.unordered else unconnected_neighbours(result.frames, result.edges)
-    return placed_figure(result.placed, undecided, missing, {f.name: k for k, f in enumerate(result.frames)})
 
 
 def _linker(names: Sequence[str]) -> Callable[[str], Markup]:
@@ -217,12 +216,6 @@ def _linker(names: Sequence[str]) -> Callable[[str], Markup]:
         return Markup("").join([*parts, escape(text[end:])])
 
     return linked
-
-
-def _settings(result: ProcessResult) -> list[tuple[str, str]]:
-    """The flags on which the scan depends; with others, and at another time, the report is the same byte for byte."""
-    flags = {key: value for key, value in vars(result.config).items() if key not in _WITHOUT_EFFECT}
-    return sorted((key, str(value)) for key, value in flags.items() if value is not None)
 
 
 def _sentence(result: ProcessResult) -> str:
@@ -262,9 +255,3 @@ def _charts(result: ProcessResult) -> list[tuple[str, str]]:
     ]  # fmt: skip
     known = [(title, unit, bars) for title, unit, bars in drawn if any(not math.isnan(v) for v in bars[0].values)]
     return [(title, charts.frame_bars(title, unit, bars)) for title, unit, bars in known]
-
-
-def _pictures(preview: Preview) -> tuple[str, str, str]:
-    shown = (preview.image, preview.coords, preview.left_out)
-    image, coords, left_out = (("" if p is None else data_uri(p)) for p in shown)
-    return image, coords, left_out

@@ -1,4 +1,4 @@
-"""Small charts as inline SVG: sharp in print, without scripts."""
+"""What reports are made of: charts as inline SVG, pictures as embedded data, colours, and filled-in templates."""
 
 import base64
 import io
@@ -166,9 +166,7 @@ def pixel_map(row: ndarray, column: ndarray, stride: int, rgb: Float[ndarray, "n
 
 
 def residual_colours(
-    values: Float[ndarray, "n"],
-    scale: ColourScale,
-    no_surface: Bool[ndarray, "n"],
+    values: Float[ndarray, "n"], scale: ColourScale, no_surface: Bool[ndarray, "n"]
 ) -> Float[ndarray, "n 3"]:
     """Colours of residuals; grey where there is no value, blue where there is no surface."""
     rgb = scale(np.nan_to_num(values))
@@ -205,8 +203,6 @@ class Bars:
 
 def frame_bars(title: str, unit: str, series: Sequence[Bars], wide: bool = False) -> str:
     """Bars per frame, several series side by side; `wide` fills the width of the page."""
-    import matplotlib
-
     with matplotlib.rc_context(_RC):
         figure, axes = _figure(10.4 if wide else 5.4, 2.1)
         count = len(series[0].values)
@@ -220,14 +216,14 @@ def frame_bars(title: str, unit: str, series: Sequence[Bars], wide: bool = False
         axes.set_xlabel("frame")
         axes.set_ylabel(unit)
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-        _legend(axes, len(series))
+        if len(series) > 1:
+            place: dict[str, Any] = {"loc": "lower right", "bbox_to_anchor": (1, 0.98), "borderaxespad": 0}
+            axes.legend(frameon=False, fontsize=8, ncols=len(series), **place)
         return _svg(figure, title)
 
 
 def histogram(title: str, unit: str, values: Float[ndarray, "n"], lower: float, upper: float) -> str:
     """Share of the values in each bin between two limits; values outside count in the outermost bins."""
-    import matplotlib
-
     with matplotlib.rc_context(_RC):
         figure, axes = _figure(5.4, 2.1)
         share = np.full(len(values), 100 / max(len(values), 1))
@@ -240,8 +236,6 @@ def histogram(title: str, unit: str, values: Float[ndarray, "n"], lower: float, 
 
 def curve(title: str, step: Sequence[float | int | None], values: Sequence[float | int | None]) -> str:
     """A convergence curve; logarithmic where positive values span more than a factor of 20."""
-    import matplotlib
-
     with matplotlib.rc_context(_RC):
         figure, axes = _figure(2.9, 1.7)
         x, y = np.asarray(step, np.float64), np.asarray(values, np.float64)
@@ -266,18 +260,8 @@ def _figure(width: float, height: float) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _legend(axes: Axes, series: int) -> None:
-    if series > 1:
-        axes.legend(
-            frameon=False, fontsize=8, ncols=series, loc="lower right", bbox_to_anchor=(1, 0.98), borderaxespad=0
-        )
-
-
 def _svg(figure: Figure, title: str) -> str:
     """The figure as an <svg> element with a title for screen readers."""
-    import matplotlib
-    from markupsafe import escape
-
     buffer = io.StringIO()
     # One salt per chart: the ids of several charts on one page must differ, and every run must give the same.
     with matplotlib.rc_context({"svg.hashsalt": title}):
@@ -410,11 +394,12 @@ def colour_layers(
         layers.append(ColourLayer("error", error, error_scale, error_units))
     if quality is not None and (quality.views > 0).any():
         most_views = ColourScale("viridis", 0.0, float(quality.views.max()))
+        angles = ColourScale("viridis", 0.0, nice_limit(float(np.nanpercentile(quality.ray_angle, 95))))
         layers += [
             _from_zero("uncertainty (1 sigma)", quality.sigma, units),
             ColourLayer("views", quality.views.astype(np.float64), most_views, "frames"),
             _from_zero("residual", quality.residual, "px"),
-            ColourLayer("ray angle", np.nan_to_num(quality.ray_angle), _angles(quality.ray_angle), "degrees"),
+            ColourLayer("ray angle", np.nan_to_num(quality.ray_angle), angles, "degrees"),
         ]
     return layers
 
@@ -423,7 +408,3 @@ def _from_zero(name: str, values: Float[ndarray, "v"], units: str) -> ColourLaye
     """Dark is small and good; values that are not known lie beyond the scale."""
     limit = nice_limit(float(np.nanpercentile(values, 95)))
     return ColourLayer(name, np.nan_to_num(values, nan=2 * limit), ColourScale("inferno", 0.0, limit), units)
-
-
-def _angles(values: Float[ndarray, "v"]) -> ColourScale:
-    return ColourScale("viridis", 0.0, nice_limit(float(np.nanpercentile(values, 95))))

@@ -1,4 +1,4 @@
-"""The report: one HTML file with which a person can judge a scan, without a network."""
+"""The report of `sl-eval`: one HTML file with which a person can judge a scan, without a network."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -66,15 +66,13 @@ class ResidualThumbnails:
         """Add one frame."""
         missed = ~pixels.hit
         difference = np.abs(pixels.captured - pixels.rendered * brightness_ratio(pixels))
-        self.frames.append(
-            FrameThumbnails(
-                frame.name,
-                figures,
-                coordinate=_map(pixels, residual_colours(pixels.coordinate, COORDINATE, missed & pixels.decoded)),
-                epipolar=_map(pixels, residual_colours(pixels.epipolar, EPIPOLAR, np.zeros_like(missed))),
-                pattern=_map(pixels, residual_colours(difference, PATTERN, missed)),
-            )
+        drawn = (
+            residual_colours(pixels.coordinate, COORDINATE, missed & pixels.decoded),
+            residual_colours(pixels.epipolar, EPIPOLAR, np.zeros_like(missed)),
+            residual_colours(difference, PATTERN, missed),
         )
+        maps = (_picture(pixels, rgb, _THUMBNAIL_SIDE, 82) for rgb in drawn)
+        self.frames.append(FrameThumbnails(frame.name, figures, *maps))
 
 
 def brightness_ratio(pixels: FramePixels) -> float:
@@ -84,13 +82,14 @@ def brightness_ratio(pixels: FramePixels) -> float:
     return float(a @ b / (b @ b)) if (b @ b) > 0 else 1.0
 
 
-def _map(pixels: FramePixels, rgb: Float[ndarray, "n 3"]) -> str:
-    return data_uri(shrink(pixel_map(pixels.row, pixels.column, pixels.stride, rgb), _THUMBNAIL_SIDE))
+def _picture(pixels: FramePixels, rgb: Float[ndarray, "n 3"], side: int, quality: int) -> str:
+    return data_uri(shrink(pixel_map(pixels.row, pixels.column, pixels.stride, rgb), side), quality)
 
 
 # Captured and rendered pattern of a few frames, side by side.
 
 _COMPARISON_SIDE = 420
+DIFFERENCE = ColourScale("RdBu_r", -0.6, 0.6)
 
 
 @dataclass(frozen=True)
@@ -106,47 +105,29 @@ class Comparison:
 
 
 def compare_frames(
-    surface: IndexedMesh,
-    scan: Scan,
-    agreement: CaptureAgreement,
-    poses: DevicePoses,
+    surface: IndexedMesh, scan: Scan, agreement: CaptureAgreement, poses: DevicePoses
 ) -> list[Comparison]:
-    """The frames with the best, the median and the worst pattern agreement."""
-    pattern = scan.read_pattern()
-    shown = []
-    for index, why in _chosen(agreement):
-        frame = scan.frames[index]
-        pixels = frame_pixels(
-            surface, frame, scan, pattern, poses.T_world_camera[index], poses.T_world_projector[index]
-        )
-        shown.append(_compare(frame.name, why, agreement.frames[index].pattern_cosine, pixels))
-    return shown
-
-
-def _chosen(agreement: CaptureAgreement) -> list[tuple[int, str]]:
-    """Indices of frames, and why."""
-    order = sorted(
-        (i for i, f in enumerate(agreement.frames) if math.isfinite(f.pattern_cosine)),
-        key=lambda i: -agreement.frames[i].pattern_cosine,
-    )
+    """Draw the frames with the best, the median and the worst pattern agreement."""
+    cosine = [frame.pattern_cosine for frame in agreement.frames]
+    order = sorted((k for k, value in enumerate(cosine) if math.isfinite(value)), key=lambda k: -cosine[k])
     picks: dict[int, str] = {}
     for place, why in ((0, "best agreement"), (len(order) // 2, "median"), (-1, "worst agreement")):
         if order:
             picks.setdefault(order[place], why)
-    return list(picks.items())
-
-
-def _compare(name: str, why: str, cosine: float, pixels: FramePixels) -> Comparison:
-    rendered = pixels.rendered * brightness_ratio(pixels)
-    white = max(float(np.nanpercentile(pixels.captured, 99.5)), 1e-6) if len(pixels.captured) else 1.0
-    return Comparison(
-        name=name,
-        why=why,
-        captured=_picture(pixels, _grey(pixels.captured / white, pixels, np.ones_like(pixels.hit))),
-        rendered=_picture(pixels, _grey(rendered / white, pixels, pixels.lit)),
-        difference=_picture(pixels, _signed((pixels.captured - rendered) / white, pixels)),
-        cosine=cosine,
-    )
+    pattern, shown = scan.read_pattern(), []
+    for k, why in picks.items():
+        T = poses.T_world_camera[k], poses.T_world_projector[k]
+        pixels = frame_pixels(surface, scan.frames[k], scan, pattern, *T)
+        rendered = pixels.rendered * brightness_ratio(pixels)
+        white = max(float(np.nanpercentile(pixels.captured, 99.5)), 1e-6) if len(pixels.captured) else 1.0
+        drawn = (
+            _grey(pixels.captured / white, pixels, np.ones_like(pixels.hit)),
+            _grey(rendered / white, pixels, pixels.lit),
+            residual_colours((pixels.captured - rendered) / white, DIFFERENCE, ~pixels.hit),
+        )
+        pictures = (_picture(pixels, rgb, _COMPARISON_SIDE, 85) for rgb in drawn)
+        shown.append(Comparison(scan.frames[k].name, why, *pictures, cosine=cosine[k]))
+    return shown
 
 
 def _grey(values: Float[ndarray, "n"], pixels: FramePixels, known: ndarray) -> Float[ndarray, "n 3"]:
@@ -156,19 +137,11 @@ def _grey(values: Float[ndarray, "n"], pixels: FramePixels, known: ndarray) -> F
     return rgb
 
 
-def _signed(values: Float[ndarray, "n"], pixels: FramePixels) -> Float[ndarray, "n 3"]:
-    return residual_colours(values, ColourScale("RdBu_r", -0.6, 0.6), ~pixels.hit)
-
-
-def _picture(pixels: FramePixels, rgb: Float[ndarray, "n 3"]) -> str:
-    return data_uri(shrink(pixel_map(pixels.row, pixels.column, pixels.stride, rgb), _COMPARISON_SIDE), quality=85)
-
-
 # What the report says about the intrinsics of a run, from its training.json.
 
 
 def intrinsics_hint(training: dict[str, Any] | None, scan: Scan) -> str:
-    """How the run changed the intrinsics, and which ones would agree better; "" if there is nothing to say."""
+    """Say how the run changed the intrinsics, and which ones would agree better; "" if there is nothing to say."""
     record = (training or {}).get("intrinsics")
     if not isinstance(record, dict):
         return ""
@@ -232,7 +205,13 @@ class SurfacePictures:
 def render_report(report: ReportInput) -> str:
     """The page as text."""
     evaluation, scan = report.evaluation, report.inputs.scan
-    surface, comparisons, script, drawn = _parts(report)
+    surface, comparisons, script, changes = _parts(report)
+    frames, limit = evaluation.agreement.frames, 2 * evaluation.agreement.coordinate_px_median
+    residuals = [
+        charts.Bars("coordinates", [f.coordinate_px_median for f in frames]),
+        charts.Bars("epipolar", [f.epipolar_px_median for f in frames]),
+    ]
+    truth = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
     values = {
         "report": report,
         "evaluation": evaluation,
@@ -247,44 +226,31 @@ def render_report(report: ReportInput) -> str:
         "coordinate_scale": COORDINATE,
         "epipolar_scale": EPIPOLAR,
         "pattern_scale": PATTERN,
-        "residual_chart": drawn.residuals,
-        "outliers": _outliers(evaluation),
-        "changes": drawn.changes,
+        "residual_chart": charts.frame_bars("Median residuals by frame", "pattern px", residuals, wide=True),
+        "outliers": {f.name for f in frames if not f.coordinate_px_median <= limit},
+        "changes": changes,
         "lengths": report.lengths,
-        "truth": _truth_rows(evaluation),
-        "training": drawn.training,
+        "truth": [(name, errors) for name, errors in truth if errors is not None],
+        "training": _training(report.inputs.training),
         "summary": _summary(report),
         "plotly": script,
     }
     return page(_TEMPLATE, values)
 
 
-def _parts(report: ReportInput) -> tuple[SurfacePictures, list[Comparison], str, "DrawnCharts"]:
+def _parts(report: ReportInput) -> tuple[SurfacePictures, list[Comparison], str, "PoseChanges | None"]:
     """What takes long, side by side. Matplotlib's settings belong to the process: one task draws with it at a time."""
     surface = IndexedMesh(report.inputs.mesh)
     compare = partial(compare_frames, surface, report.inputs.scan, report.evaluation.agreement, report.inputs.poses)
     tasks: list[Callable[[], Any]] = [
-        partial(_surface_pictures, report, surface), partial(_charts, report), compare, compressed_script,
+        partial(_surface_pictures, report, surface), partial(_pose_changes, report), compare, compressed_script,
     ]  # fmt: skip
-    (pictures, errors), drawn, comparisons, script = results(tasks)
+    (pictures, errors), changes, comparisons, script = results(tasks)
     if errors is not None and pictures.scale is not None:
         title, units = "Signed distance of the surface from the reference", report.evaluation.truth_units
         histogram = charts.histogram(title, units, errors, pictures.scale.lower, pictures.scale.upper)
         pictures = replace(pictures, histogram=histogram)
-    return pictures, comparisons, script, drawn
-
-
-@dataclass(frozen=True)
-class DrawnCharts:
-    """All charts but the histogram, as SVG."""
-
-    residuals: str
-    changes: "PoseChanges | None"
-    training: "TrainingSection | None"
-
-
-def _charts(report: ReportInput) -> DrawnCharts:
-    return DrawnCharts(_residual_chart(report.evaluation), _pose_changes(report), _training(report.inputs.training))
+    return pictures, comparisons, script, changes
 
 
 def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[SurfacePictures, Float[ndarray, "n"] | None]:
@@ -314,25 +280,6 @@ def _errors(
     exact = isinstance(reference, MeshReference)
     limit = charts.nice_limit((score.accuracy if exact else score.completeness).p95)
     return reference.surface_errors(surface, score.S_truth_result, points), ColourScale("RdYlBu_r", -limit, limit)
-
-
-def _residual_chart(evaluation: Evaluation) -> str:
-    frames = evaluation.agreement.frames
-    return charts.frame_bars(
-        "Median residuals by frame",
-        "pattern px",
-        [
-            charts.Bars("coordinates", [f.coordinate_px_median for f in frames]),
-            charts.Bars("epipolar", [f.epipolar_px_median for f in frames]),
-        ],
-        wide=True,
-    )
-
-
-def _outliers(evaluation: Evaluation) -> set[str]:
-    """Frames whose coordinate residual is more than twice the scan's."""
-    limit = 2 * evaluation.agreement.coordinate_px_median
-    return {f.name for f in evaluation.agreement.frames if not f.coordinate_px_median <= limit}
 
 
 @dataclass(frozen=True)
@@ -372,11 +319,6 @@ def _pose_changes(report: ReportInput) -> PoseChanges | None:
             ]
             figures.append(charts.frame_bars(title, unit, series))
     return PoseChanges(change, sigma, report.inputs.unplaced, figures)
-
-
-def _truth_rows(evaluation: Evaluation) -> list[tuple[str, PoseErrors]]:
-    rows = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
-    return [(name, errors) for name, errors in rows if errors is not None]
 
 
 @dataclass(frozen=True)

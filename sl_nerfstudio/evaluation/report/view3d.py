@@ -1,4 +1,4 @@
-"""What the interactive views share: a box of equal scale in all directions, viewpoints, and devices as pyramids."""
+"""Interactive views of surfaces, cameras and projectors, by Plotly, that work without a network."""
 
 import base64
 import gzip
@@ -66,7 +66,7 @@ class PlotBox:
 def viewpoint(
     points: Float64[ndarray, "n 3"], centre: Float64[ndarray, "3"], T_world_camera: Float64[ndarray, "m 4 4"]
 ) -> Viewpoint:
-    """From where all points are in the picture, beside the first of the cameras; up is the cameras' up."""
+    """Look from where all points are in the picture, beside the first of the cameras; up is the cameras' up."""
     up = T_world_camera[:, :3, 1].mean(0)
     if np.linalg.norm(up) < 0.1:  # cameras held in every orientation
         up = T_world_camera[0, :3, 1]
@@ -76,7 +76,7 @@ def viewpoint(
 
 
 def frustum_length(T_world_device: Float64[ndarray, "n 4 4"], centre: Float64[ndarray, "3"]) -> float:
-    """How long to draw the pyramids of some devices around an object."""
+    """Choose how long to draw the pyramids of some devices around an object."""
     return _FRUSTUM * float(np.median(np.linalg.norm(T_world_device[:, :3, 3] - centre, axis=1)))
 
 
@@ -376,7 +376,7 @@ def _drawn(
 def _between(
     frames: Sequence[PlacedFrame], missing: Sequence[tuple[str, str]], centre: Float64[ndarray, "3"]
 ) -> DrawnDevices | None:
-    """Where frames should be added: midway between two cameras, as far from the object, looking at it."""
+    """Draw where frames should be added: midway between two cameras, as far from the object, looking at it."""
     named = {frame.name: frame for frame in frames}
     pairs = [(named[a], named[b]) for a, b in missing if a in named and b in named]
     if not pairs:

@@ -76,11 +76,6 @@ def test_a_changed_scan_is_refused_by_export_and_resume(scan_root, copy, tmp_pat
     assert "sphere: does not belong to" in capfd.readouterr().err and not (tmp_path / "new").exists()
 
 
-def test_a_scan_that_was_only_moved_is_taken(scan_root, copy, tmp_path):
-    moved = Path(shutil.copytree(scan_root, tmp_path / "elsewhere"))
-    assert load_run(copy, moved).step == 11
-
-
 def edited(copy: Path, change: Callable[[object], None]) -> Path:
     config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
     change(config)
@@ -89,16 +84,11 @@ def edited(copy: Path, change: Callable[[object], None]) -> Path:
 
 
 def test_settings_that_were_edited_are_refused(copy):
-    edited(copy, lambda config: setattr(config.pipeline.model.annealing, "kappa_end", 300.0))
+    edited(copy, lambda config: setattr(config.pipeline.model.losses, "eikonal", 0.3))
     with pytest.raises(UserError, match=r"its settings are not those that the run was started with"):
         load_run(copy)
     with pytest.raises(UserError, match=r"its settings are not those that the run was started with"):
         check_run_folder(copy)
-
-
-def test_settings_without_effect_may_be_edited(copy):
-    edited(copy, lambda config: setattr(config.pipeline.model, "eval_num_rays_per_chunk", 512))
-    assert load_run(copy).step == 11
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +101,7 @@ def other_run(scan_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return folder_of(output)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_another_run_is_refused_by_every_command(copy, other_run, capfd):
     """As if a second training had been stopped after it wrote config.yml."""
     words = r"config.yml and the checkpoint of this run do not belong together: the settings"

@@ -10,12 +10,7 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.model.run_files import (
-    checkpoints_in,
-    find_checkpoint,
-    read_checkpoint,
-    write_checkpoint,
-)
+from sl_nerfstudio.model.run_files import checkpoints_in, find_checkpoint, read_checkpoint, write_checkpoint
 from tests.model.training.small_runs import require_equal, settings, status, train
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely

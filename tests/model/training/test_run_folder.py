@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.methods import sl_neus, sl_neus_paper
+from sl_nerfstudio.methods import sl_neus_paper
 from sl_nerfstudio.model.run_files import LOCK, RunFolder
 from tests.model.training.small_runs import (
     child,
@@ -46,6 +46,7 @@ def test_a_begun_run_and_a_folder_of_something_else_are_not_overwritten(scan_roo
         assert content(folder) == {file: b"mine"} and words in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_folder_that_a_killed_process_left_empty_is_used(scan_root, tmp_path):
     folder = folder_of(tmp_path)
     folder.mkdir(parents=True)
@@ -55,16 +56,7 @@ def test_a_folder_that_a_killed_process_left_empty_is_used(scan_root, tmp_path):
     assert not list(folder.glob("*.partial")) and last_state(folder)["step"] == 0
 
 
-def test_a_run_is_trained_further_in_its_own_folder(scan_root, tmp_path):
-    """The README's command. Both halves together are the run that was not split."""
-    train(settings(scan_root, tmp_path, "whole", steps=8))
-    train(settings(scan_root, tmp_path, "split", steps=4, schedule_iterations=8))
-    folder = folder_of(tmp_path, "split")
-    further = settings(scan_root, tmp_path, "split", steps=4, load_dir=folder / "nerfstudio_models")
-    train(further)
-    require_equal(last_state(folder), last_state(folder_of(tmp_path, "whole")))
-
-
+@pytest.mark.slow
 def test_a_run_whose_schedule_has_ended_is_trained_further_as_if_it_had_not_stopped(scan_root, finished, tmp_path):
     """Its checkpoint holds no moments of the optimisers, because a longer run forgets them there, too."""
     assert not any(part["state"] for part in last_state(finished)["optimizers"].values())
@@ -75,6 +67,7 @@ def test_a_run_whose_schedule_has_ended_is_trained_further_as_if_it_had_not_stop
     require_equal(last_state(folder_of(tmp_path, "rest")), whole)
 
 
+@pytest.mark.slow
 def test_the_papers_method_is_trained_further(scan_root, tmp_path):
     """Its learning rates end before its annealing does."""
     for more in ({}, {"load_dir": tmp_path / "sphere/sl-neus-paper/first/nerfstudio_models"}):
@@ -96,6 +89,7 @@ def test_it_is_not_trained_further_with_other_settings(scan_root, finished, capf
     assert "holds a run with other settings, and nothing was changed" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_it_branches_off_into_another_folder(scan_root, finished, tmp_path):
     """There, settings may change, and its checkpoint belongs to the new config.yml."""
     other = settings(scan_root, tmp_path, "other", steps=2, load_dir=finished / "nerfstudio_models")
@@ -108,6 +102,7 @@ def test_it_branches_off_into_another_folder(scan_root, finished, tmp_path):
     assert state["step"] == 13 and bytes(state["pipeline"]["settings_fingerprint"].tolist()) == wanted
 
 
+@pytest.mark.slow
 def test_an_earlier_checkpoint_does_not_continue_where_a_later_one_is(scan_root, tmp_path, capfd):
     train(settings(scan_root, tmp_path, steps=5, steps_per_save=2, save_only_latest_checkpoint=False))
     models = folder_of(tmp_path) / "nerfstudio_models"
@@ -172,7 +167,3 @@ def test_numbers_and_names_that_no_training_can_have(scan_root, tmp_path, capfd,
 def test_a_place_that_cannot_be_written(place):
     with pytest.raises(UserError, match=r"cannot be written \((.|\n)*--output-dir"):
         RunFolder(Path(place))
-
-
-def test_the_viewer_listens_on_this_machine_only():
-    assert {method.config.viewer.websocket_host for method in (sl_neus, sl_neus_paper)} == {"127.0.0.1"}

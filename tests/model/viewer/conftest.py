@@ -47,6 +47,8 @@ class SphereModel:
     def joint_covariance(self) -> None:
         return None
 
+    pose_sigma = self_calibration = history = joint_covariance
+
     def unplaced(self) -> list[bool]:
         return self.lost
 

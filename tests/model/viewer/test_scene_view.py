@@ -2,13 +2,11 @@
 
 import math
 import time
-from types import SimpleNamespace
 from typing import Any
 
 import matplotlib
 import numpy as np
 import pytest
-import viser
 import viser.transforms as vtf
 
 from sl_nerfstudio.geometry.devices import Device
@@ -66,10 +64,6 @@ def test_every_device_is_named_coloured_and_where_it_stood(view: SceneView) -> N
             np.testing.assert_allclose(looks, -T[k, :3, 2], atol=1e-6)
 
 
-def test_the_picture_does_not_hide_devices(view: SceneView) -> None:
-    assert view.viewer.control_panel._layer_depth.value is False
-
-
 @pytest.mark.parametrize(("fov", "aspect"), [(math.radians(75), 1.8), (0.6, 0.5)])
 def test_the_first_view_is_framed_on_the_object_with_all_devices_in_sight(view: SceneView, fov: float, aspect: float):
     T = np.concatenate(view._numpy_poses())
@@ -81,16 +75,6 @@ def test_the_first_view_is_framed_on_the_object_with_all_devices_in_sight(view: 
     seen = (T[:, :3, 3] - found.eye) @ np.stack([right, np.cross(back, right), -back], 1)
     edge = np.abs(seen[:, :2] / seen[:, 2:]) / (math.tan(fov / 2) * np.array([aspect, 1.0]))
     assert (seen[:, 2] > 0).all() and edge.max() < 1
-
-
-def test_a_client_begins_there(view: SceneView) -> None:
-    camera = SimpleNamespace(fov=0.0, aspect=0.0)  # before it has said its own
-    client = object.__new__(viser.ClientHandle)
-    client.camera = camera  # type: ignore[assignment]
-    view._look_at_object(client)
-    expected = first_view(np.concatenate(view._numpy_poses()), math.radians(75), 1.5)
-    np.testing.assert_allclose(camera.position, 10 * expected.eye)
-    np.testing.assert_allclose(camera.look_at, [0, 0, 0])
 
 
 def test_devices_follow_their_poses_with_a_line_from_the_start(view: SceneView) -> None:
@@ -226,14 +210,6 @@ def test_a_field_without_a_surface_is_said_not_raised(view: SceneView) -> None:
     model_of(view).offset = 0.0
     view._changed("update")
     assert "/surface" in view._nodes
-
-
-def test_nothing_happens_without_a_viewer(sphere_scan: Any) -> None:
-    from tests.model.viewer.conftest import SphereModel
-
-    view = SceneView(SphereModel(sphere_scan))
-    view.update(force=True)
-    view.show_devices()
 
 
 def test_vertical_field_of_view() -> None:

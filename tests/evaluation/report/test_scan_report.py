@@ -1,0 +1,348 @@
+"""The report of sl-eval: one file with everything, and its pictures."""
+
+import base64
+import io
+import re
+from dataclasses import asdict, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement, FramePixels
+from sl_nerfstudio.evaluation.evaluate import EvaluationInputs, Length, evaluate
+from sl_nerfstudio.evaluation.judgement import judge
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.reference import PointReference, mesh_reference
+from sl_nerfstudio.evaluation.report.charts import OrthographicView, draw_overlaps, render
+from sl_nerfstudio.evaluation.report.scan_report import (
+    ReportInput,
+    ResidualThumbnails,
+    brightness_ratio,
+    compare_frames,
+    intrinsics_hint,
+    render_report,
+)
+from sl_nerfstudio.evaluation.report.view3d import decimated
+from sl_nerfstudio.geometry.devices import UNCHANGED, DeviceChange, IntrinsicsChange
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.meshing.mesh import VertexQuality
+from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord
+from sl_nerfstudio.scan import PoseSigma, Scan, read_scan
+from tests.dataparser.tiny_scan import TinyScan
+
+from ..faceted_scan import CAMERA, FacetedScan
+from ..shapes import blob, sphere
+from .pages import Page, figure_of, unpacked
+
+TRAINING = {
+    "settings": {"method": "sl-neus", "model": {"refine_poses": "free", "note": "<script>alert(1)</script>"}},
+    "versions": {"torch": "2.11"},
+    "curves": {"step": [0, 100, 200], "loss": [5.0, 0.5, 0.1], "coordinate_px": [20.0, None, 0.4]},
+    "intrinsics": {
+        "change": asdict(IntrinsicsChange(DeviceChange(0.01), DeviceChange(-0.005))),
+        "self_calibration": {
+            "change": asdict(IntrinsicsChange(DeviceChange(0.002), DeviceChange())),
+            "sigma": asdict(IntrinsicsChange(DeviceChange(1e-4, 1e-4, 1e-4), DeviceChange(1e-4))),
+            "chi_square": 412.3,
+            "contradicts": True,
+        },
+    },
+}
+
+
+def text_of(page: str) -> str:
+    return " ".join(" ".join(Page(page).text).split())
+
+
+@pytest.fixture(scope="module")
+def full_report(clean_scan: Path) -> str:
+    """A report with every section filled."""
+    scan, made = read_scan(clean_scan), FacetedScan()
+    true = made.true_poses()
+    moved = DevicePoses(true.T_world_camera.copy(), true.T_world_projector)
+    moved.T_world_camera[1, :3, 3] += 0.5
+    thumbnails = ResidualThumbnails()
+    reference = mesh_reference(made.truth(), scan, true, 5000)
+    evaluation = evaluate(made.truth(), scan, moved, reference, true, samples=5000, on_frame=thumbnails)
+    sigma = PoseSigma(0.11, 0.022, 0.033, 0.044)
+    path = Path("refined/transforms.json")
+    truth = made.truth()
+    count = len(truth.vertices)
+    views = np.arange(count) % 3  # a third of the vertices is not observed
+    stated = np.where(views > 0, 0.05, np.nan)
+    quality = VertexQuality(stated, 0.5 * stated, views, 4 * stated, 300 * stated)
+    inputs = EvaluationInputs(
+        truth, scan, moved, true, reference, path, [sigma, None, sigma], [scan.frames[1].name], TRAINING, quality
+    )
+    end = (0.0, 0.0, 1.0)
+    lengths = [
+        Length("width <of> it", end, end, 12.3456, 0.0123, 0.0111, 0.0055, (3, 2)),
+        Length("height", end, end, 7.0, None, None, None, (3, 0)),
+    ]
+    made_at = datetime(2026, 1, 2, 3, 4)
+    return render_report(
+        ReportInput(
+            evaluation,
+            judge(evaluation, intrinsics_hint(inputs.training, scan)),
+            inputs,
+            thumbnails.frames,
+            "<mesh & co>.ply",
+            made_at,
+            lengths,
+        )
+    )
+
+
+def test_report_is_one_file_that_loads_nothing_from_elsewhere(full_report: str) -> None:
+    page = Page(full_report)
+    assert page.loaded and all(address.startswith("data:image/") for address in page.loaded)
+    style = "".join(re.findall(r"<style>(.*?)</style>", full_report, flags=re.S))
+    assert "@import" not in style and "url(" not in style
+    addresses = set(re.findall(r"(?:https?:)?//[a-z0-9-]+(?:\.[a-z0-9-]+)+[^\s\"'<>]*", full_report))
+    assert addresses <= {"http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"}  # names, not addresses
+    assert "default-src 'none'" in full_report  # and the browser enforces it
+    assert len(full_report) < 10e6
+
+
+def test_report_is_accessible_and_its_links_lead_somewhere(full_report: str) -> None:
+    page = Page(full_report)
+    assert page.undescribed == []
+    assert len(page.ids) == len(set(page.ids))
+    assert set(page.anchors) <= set(page.ids)
+    assert '<html lang="en">' in full_report
+
+
+def test_report_tells_everything(full_report: str) -> None:
+    text = text_of(full_report)
+    for what in (
+        "Scan report: scan", "<mesh & co>.ply", "refined/transforms.json", "2026-01-02 03:04", "What it means",
+        "frame_00000", "frame_00002", "best agreement", "worst agreement", "Accuracy, RMS", "F-score", "0.022",
+        "model.refine_poses", "free", "<script>alert(1)</script>", "2.11", "loss", "3 frames", "64 × 56 pixels",
+        "known (by construction)", "σ frame", "The intrinsics contradict the captures (chi square 412, by chance 6)",
+        "Frames that cannot be placed: frame_00001.",
+        "width <of> it 12.346 0.0123 0.0111 0.00550 3 and 2", "height 7 unknown unknown unknown 3 and 0",
+        "focal length of the camera +1.00 %, of the projector -0.50 %", "camera: focal length +0.20 ± 0.01 %",
+    ):  # fmt: skip
+        assert what in text, what
+    assert "<script>alert(1)" not in full_report  # only escaped
+    assert full_report.count('class="maps"') == 3
+
+
+def test_interactive_surface_is_complete(full_report: str) -> None:
+    figure = figure_of(full_report)
+    assert [trace["name"] for trace in figure["data"]] == ["surface", "cameras", "projectors", "measured"]
+    menu, views = figure["layout"]["updatemenus"]
+    assert [button["label"] for button in views["buttons"]] == ["object", "all devices"]
+    names = ["error", "uncertainty (1 sigma)", "views", "residual", "ray angle"]
+    assert [button["label"] for button in menu["buttons"]] == names
+    changes = [button["args"][0] for button in menu["buttons"]]
+    count = len(FacetedScan().truth().vertices)
+    assert all(len(change["intensity"][0]) == count and button["args"][1] == [0]
+               for change, button in zip(changes, menu["buttons"], strict=True))  # fmt: skip
+    assert changes[0]["intensity"][0] == figure["data"][0]["intensity"]
+    sigma, views = (np.array(changes[k]["intensity"][0]) for k in (1, 2))
+    assert np.array_equal(views, np.arange(count) % 3)
+    assert np.allclose(sigma[views > 0], 0.05) and (sigma[views == 0] > changes[1]["cmax"]).all()  # marked
+    assert [change["colorbar.title.text"] for change in changes] == ["mm", "mm", "frames", "px", "degrees"]
+    stated = unpacked(figure["data"][0]["customdata"])  # of the ends of a measured line
+    np.testing.assert_allclose(stated, np.where(np.arange(count) % 3 > 0, 0.05, np.nan), rtol=1e-6)
+
+
+def test_pyramids_stand_where_the_devices_do_and_open_towards_what_they_see(full_report: str) -> None:
+    figure, made = figure_of(full_report), FacetedScan()
+    true = made.true_poses()
+    true.T_world_camera[1, :3, 3] += 0.5  # as in the report
+    for trace, T, device in ((1, true.T_world_camera, CAMERA), (2, true.T_world_projector, made.projector)):
+        drawn = np.stack([unpacked(figure["data"][trace][axis]) for axis in "xyz"], 1).reshape(3, -1, 3)
+        assert np.isnan(drawn[:, -1]).all()  # the gap to the next one
+        np.testing.assert_allclose(drawn[:, 0], T[:, :3, 3], rtol=1e-5)
+        ray = np.array([-device.cx / device.fl_x, device.cy / device.fl_y, -1.0])  # of the upper left corner
+        side = drawn[:, 1] - drawn[:, 0]
+        expected = np.einsum("nij,j->ni", T[:, :3, :3], ray / np.linalg.norm(ray))
+        np.testing.assert_allclose(side / np.linalg.norm(side, axis=1, keepdims=True), expected, atol=1e-4)
+        assert figure["data"][trace]["text"][0].endswith("of frame 0: frame_00000")
+
+
+def test_the_view_of_all_devices_shows_all_of_them(full_report: str) -> None:
+    """By the way of Plotly: axes onto the aspect ratio, then a pinhole of 45 degrees, looking at the centre."""
+    figure = figure_of(full_report)
+    scene = figure["layout"]["scene"]
+    low, high = (np.array([scene[f"{axis}axis"]["range"][k] for axis in "xyz"]) for k in (0, 1))
+    ratio = np.array([scene["aspectratio"][axis] for axis in "xyz"])
+    np.testing.assert_allclose(ratio / (high - low), (ratio / (high - low))[0])  # of equal scale
+    shown = {}
+    for button in figure["layout"]["updatemenus"][1]["buttons"]:
+        camera = {k: np.array([v[axis] for axis in "xyz"]) for k, v in button["args"][0]["scene.camera"].items()}
+        back = camera["eye"] - camera["center"]
+        back /= np.linalg.norm(back)
+        right = np.cross(camera["up"], back)
+        right /= np.linalg.norm(right)
+        for number, trace in enumerate(figure["data"][:3]):
+            p = np.stack([unpacked(trace[axis]) for axis in "xyz"], 1)
+            p = (p[np.isfinite(p).all(1)] - low) / (high - low) * ratio - ratio / 2 - camera["eye"]
+            edge = np.abs(np.stack([p @ right / (1030 / 560), p @ np.cross(back, right)], 1) / -(p @ back)[:, None])
+            shown[button["label"], number] = (edge.max() / np.tan(np.pi / 8)) * (1 if (p @ back < 0).all() else np.inf)
+    assert shown["object", 0] < 1 and max(shown["all devices", k] for k in range(3)) < 1
+    assert max(shown["all devices", k] for k in range(3)) > 0.85 and shown["object", 0] > 0.85  # and not far away
+
+
+@pytest.mark.parametrize("with_points", [False, True])
+def test_report_without_truth_training_or_refinement_says_so(clean_scan: Path, with_points: bool) -> None:
+    scan, truth, thumbnails = read_scan(clean_scan), FacetedScan().truth(), ResidualThumbnails()
+    points = PointReference(IndexedMesh(truth).sample(5000, 0)[0], "some points") if with_points else None
+    evaluation = evaluate(truth, scan, scan.poses, points, samples=5000, on_frame=thumbnails)
+    inputs = EvaluationInputs(truth, scan, scan.poses, None, points, None)
+    text = text_of(render_report(ReportInput(evaluation, judge(evaluation), inputs, thumbnails.frames, "mesh.ply")))
+    assert "The scan's own poses were evaluated" in text
+    assert "There is no training.json next to the poses file" in text
+    assert with_points or "Accuracy" not in text
+    assert ("No truth or reference is known for this scan" in text) == (not with_points)
+    assert ("Distance from reference" in text and "some points" in text) == with_points
+
+
+def test_offsets_from_reference_points_are_smooth_and_signed() -> None:
+    truth, result = IndexedMesh(sphere(10.0, 100)), IndexedMesh(sphere(10.25, 100))
+    reference = PointReference(truth.sample(3000, 0)[0], "")
+    errors = reference.surface_errors(result, Similarity.identity(), result.sample(500, 1)[0])
+    np.testing.assert_allclose(errors, 0.25, atol=0.02)
+
+
+def test_picture_shows_the_near_side_upright_and_in_colour() -> None:
+    surface = IndexedMesh(sphere(10.0, 40))
+    red_top = np.where(surface.vertices[:, 2:] > 0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    picture = render(
+        surface, OrthographicView(np.array([0.0, -1, 0]), np.array([0.0, 0, 1])), red_top, height=60, width=80
+    )
+    assert picture.shape == (60, 80, 3)
+    np.testing.assert_array_equal(picture[0, 0], 1.0)  # white outside
+    assert picture[15, 40, 0] > 0.3 and picture[15, 40, 2] < 0.05
+    assert picture[45, 40, 2] > 0.15 and picture[45, 40, 0] < 0.05
+    inside = (picture != 1).any(2)
+    assert inside.sum() == pytest.approx(np.pi * (0.47 * 60) ** 2, rel=0.05)
+
+
+def test_decimation_keeps_the_shape() -> None:
+    mesh = blob(120)
+    small, nearest = decimated(mesh, 2000)
+    assert len(small.faces) <= 2000 and len(nearest) == len(small.vertices)
+    assert IndexedMesh(mesh).distance(small.vertices).max() < 0.01
+    assert np.linalg.norm(mesh.vertices[nearest] - small.vertices, axis=1).max() < 0.1
+    same, index = decimated(blob(8), 2000)
+    assert same.faces.shape == blob(8).faces.shape and index[-1] == len(blob(8).vertices) - 1
+
+
+FRAME = FrameAgreement("f", 1000, 1.0, 1.0, 0.9, 0.35, 1.0, 0.2, 0.95, 0.5, 20.0, 0.99, 0.97, 0.001, 0.0)
+
+
+def picture(address: str) -> np.ndarray:
+    assert address.startswith("data:image/webp;base64,")
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGB"), dtype=float) / 255
+
+
+def agreement_of(scan, cosines: list[float]) -> CaptureAgreement:
+    frames = tuple(replace(FRAME, name=f.name, pattern_cosine=c) for f, c in zip(scan.frames, cosines, strict=True))
+    return CaptureAgreement(0.35, 1.0, 0.2, 0.95, 1.0, 0.5, 20.0, frames)
+
+
+def test_the_best_the_median_and_the_worst_frame_are_compared(clean_scan: Path) -> None:
+    scan, made = read_scan(clean_scan), FacetedScan()
+    found = compare_frames(IndexedMesh(made.truth()), scan, agreement_of(scan, [0.5, 0.9, 0.1]), scan.poses)
+    assert [(c.name, c.why, c.cosine) for c in found] == [
+        ("frame_00001", "best agreement", 0.9),
+        ("frame_00000", "median", 0.5),
+        ("frame_00002", "worst agreement", 0.1),
+    ]
+    for one in found:
+        captured, rendered, difference = (picture(a) for a in (one.captured, one.rendered, one.difference))
+        assert captured.shape == rendered.shape == difference.shape
+        grey = (np.ptp(captured, axis=2) < 0.05) & (np.ptp(rendered, axis=2) < 0.05)  # blue: no surface
+        assert grey.mean() > 0.95 and np.abs(captured - rendered)[grey].mean() < 0.05
+        assert np.ptp(difference[grey], axis=-1).mean() < 0.15  # nearly white: no difference
+    surface, nan = IndexedMesh(made.truth()), float("nan")
+    only = compare_frames(surface, scan, agreement_of(scan, [nan, 0.4, nan]), scan.poses)
+    assert [c.name for c in only] == ["frame_00001"]
+
+
+def test_thumbnails_show_every_frame_in_order_and_colour_a_shift(clean_scan: Path) -> None:
+    scan, made = read_scan(clean_scan), FacetedScan()
+    thumbnails = ResidualThumbnails()
+    evaluate(made.truth(), scan, scan.poses, on_frame=thumbnails)
+    assert [f.name for f in thumbnails.frames] == [f.name for f in scan.frames]
+    for frame in thumbnails.frames:
+        assert all(max(picture(a).shape) <= 150 for a in (frame.coordinate, frame.epipolar, frame.pattern))
+        assert picture(frame.coordinate).min() > 0.7  # pale yellow and white: no residual
+
+
+def test_brightness_is_matched_in_least_squares() -> None:
+    n = 50
+    rendered = np.random.default_rng(0).random(n)
+    flags = np.ones(n, dtype=bool)
+    pixels = FramePixels(
+        row=np.arange(n), column=np.arange(n), stride=1, hit=flags, lit=np.arange(n) < 40, decoded=flags,
+        coords=np.zeros((n, 2)), offset=np.zeros((n, 2)), epipolar=np.zeros(n),
+        captured=np.where(np.arange(n) < 40, 1.7 * rendered, 9.0),
+        rendered=rendered, depth_per_px=np.ones(n), ray_angle_deg=np.ones(n), behind=np.zeros(n),
+        noise_px=0.1, footprint_px=1.0,
+    )  # fmt: skip
+    assert brightness_ratio(pixels) == pytest.approx(1.7)  # unlit pixels do not count
+    assert brightness_ratio(replace(pixels, lit=~flags)) == 1.0
+
+
+def test_the_overlap_graph_is_a_drawing_with_every_frame_and_edge() -> None:
+    names = ["a", "b & c", "<d>"]
+    frames = [FrameRecord(name, name != "<d>", "", "") for name in names]
+    edges = [
+        EdgeRecord(("a", "b & c"), overlap=0.5, fitness=0.9, used=True, undecided=False),
+        EdgeRecord(("a", "<d>"), overlap=0.1, fitness=0.2, used=False, undecided=False),
+        EdgeRecord(("a", "gone"), overlap=0.1, fitness=0.2, used=False, undecided=False),
+    ]
+    svg = ElementTree.fromstring(draw_overlaps(frames, edges))
+    assert svg.get("aria-label") == "Overlap graph"
+    lines, circles = svg.findall("line"), svg.findall("g/circle")
+    assert len(lines) == 2 and [title.text for title in svg.findall("g/title")] == names
+    assert [line.get("stroke-dasharray") is not None for line in lines] == [True, False]  # rejected ones are below
+    assert float(lines[1].get("stroke-width", 0)) > float(lines[0].get("stroke-width", 0))
+    assert "overlap 50%, agreement 90%" in (lines[1].findtext("title") or "")
+    assert circles[0].get("fill") == circles[1].get("fill") != circles[2].get("fill")
+    places = {(circle.get("cx"), circle.get("cy")) for circle in circles}
+    ends = {(line.get(f"x{k}"), line.get(f"y{k}")) for line in lines for k in (1, 2)}
+    assert len(places) == 3 and ends == places
+
+
+BETTER = IntrinsicsChange(DeviceChange(0.02, 0.0, 0.0), DeviceChange(0.0, -0.01, 0.0))
+SIGMA = IntrinsicsChange.of([0.001] * 6)
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    return read_scan(TinyScan(frames=2).write(tmp_path_factory.mktemp("scans") / "scan"))
+
+
+def record(change: IntrinsicsChange, contradicts: bool | None) -> dict[str, Any]:
+    found = {"change": asdict(BETTER), "sigma": asdict(SIGMA), "chi_square": 87.4, "contradicts": contradicts}
+    return {"intrinsics": {"change": asdict(change), "self_calibration": None if contradicts is None else found}}
+
+
+@pytest.mark.parametrize("training", [None, {}, record(UNCHANGED, None), record(UNCHANGED, False)])
+def test_nothing_is_said_where_nothing_is_known_or_wrong(scan: Scan, training: dict[str, Any] | None) -> None:
+    assert intrinsics_hint(training, scan) == ""
+
+
+def test_a_contradiction_is_given_in_percent_and_pixels(scan: Scan) -> None:
+    text = intrinsics_hint(record(UNCHANGED, True), scan)
+    assert "chi square 87" in text and "--pipeline.model.refine-intrinsics True" in text
+    assert "camera: focal length +2.00 ± 0.10 %, principal point (+0.0 ± 0.1, +0.0 ± 0.1) px" in text
+    assert "projector: focal length +0.00 ± 0.10 %, principal point (-1.1 ± 0.1, +0.0 ± 0.1) px" in text  # of f = 110
+    assert "are not those of the scan folder" not in text
+
+
+def test_a_change_that_was_made_is_said_first(scan: Scan) -> None:
+    change = IntrinsicsChange(DeviceChange(-0.0125), DeviceChange(0.005))
+    text = intrinsics_hint(record(change, True), scan)
+    assert text.startswith("The intrinsics are not those of the scan folder: focal length of the camera -1.25 %, ")
+    assert "of the projector +0.50 %" in text and "contradict" in text

@@ -1,0 +1,203 @@
+"""Agreement of a mesh with the captures, and holes where a frame measured surface."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.evaluation.agreement import (
+    MAX_PIXELS,
+    CaptureAgreement,
+    FramePixels,
+    find_holes,
+    frame_pixels,
+    look_up,
+    most_pixels,
+)
+from sl_nerfstudio.evaluation.evaluate import evaluate
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.scan import read_scan
+
+from .faceted_scan import FacetedScan
+from .shapes import blob, turn
+
+DOE = Device(w=96, h=80, fl_x=210.0, fl_y=205.0, cx=48.0, cy=41.0, model="DOE")
+
+
+def fit_of(root: Path, mesh: Mesh, poses: DevicePoses | None = None) -> CaptureAgreement:
+    scan = read_scan(root)
+    return evaluate(mesh, scan, poses or scan.poses).agreement
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        FacetedScan(),
+        FacetedScan(projector=DOE),
+        FacetedScan(units="m", scale=0.04, offset=(3.0, -2.0, 1.0)),
+        FacetedScan(offset=(5000.0, 2000.0, -3000.0)),
+    ],
+    ids=["pinhole", "DOE", "metres", "far from the origin"],
+)
+def test_truth_explains_a_clean_scan_perfectly(made: FacetedScan, tmp_path: Path) -> None:
+    fit = fit_of(made.write(tmp_path / "scan"), made.truth())
+    assert fit.coordinate_px_median < 1e-3
+    assert fit.coordinate_px_p95 < 1e-2
+    assert fit.epipolar_px_median < 1e-3
+    assert fit.pattern_cosine > 0.9999  # 8 bits
+    assert fit.hit_share == 1.0
+    assert [frame.name for frame in fit.frames] == ["frame_00000", "frame_00001", "frame_00002"]
+    for frame in fit.frames:
+        assert frame.lit_share > 0.97 and frame.decoded_share == 1.0
+
+
+def test_a_known_shift_of_the_decoded_coordinates_is_the_residual(clean_scan: Path) -> None:
+    scan = read_scan(clean_scan)
+    frame, made = scan.frames[0], FacetedScan()
+    coords = frame.read_coords()
+    shifted = np.where(np.isfinite(coords), coords + np.float32([0.3, -0.4]), np.nan)
+    path = clean_scan.parent / "shifted.npz"
+    np.savez(path, coords=shifted)
+    from dataclasses import replace
+
+    moved = replace(frame, coords_path=path)
+    pixels = frame_pixels(
+        IndexedMesh(made.truth()), moved, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector
+    )
+    np.testing.assert_allclose(np.median(pixels.offset, axis=0), [-0.3, 0.4], atol=1e-3)
+    assert np.median(pixels.coordinate) == pytest.approx(0.5, abs=1e-3)
+    assert np.nanmax(np.abs(pixels.epipolar)) <= 0.5 + 1e-3  # a shift has a part along the curve, too
+
+
+def test_wrong_relative_pose_shows_in_the_epipolar_residual_whatever_the_mesh(clean_scan: Path) -> None:
+    scan = read_scan(clean_scan)
+    projectors = scan.poses.T_world_projector.copy()
+    projectors[:, :3, :3] = projectors[:, :3, :3] @ turn((1, 0, 0), 1.0)  # 1 degree is 3.2 pattern pixels
+    poses = DevicePoses(scan.poses.T_world_camera, projectors)
+    sphere_fit = fit_of(clean_scan, Mesh(FacetedScan().truth().vertices * 0.8, FacetedScan().truth().faces), poses)
+    true_fit = fit_of(clean_scan, FacetedScan().truth(), poses)
+    assert 1.5 < true_fit.epipolar_px_median < 3.5
+    assert sphere_fit.epipolar_px_median == true_fit.epipolar_px_median
+    assert true_fit.pattern_cosine < 0.99
+
+
+def test_depth_of_a_pixel_and_ray_angle_follow_from_the_set_up(clean_scan: Path) -> None:
+    fit = fit_of(clean_scan, FacetedScan().truth())
+    true = FacetedScan().true_poses()
+    centres = (T[:, :3, 3] for T in (true.T_world_camera, true.T_world_projector))
+    camera, projector = (c / np.linalg.norm(c, axis=1)[:, None] for c in centres)
+    radius = 32.0  # the surface is nearer to the devices than the centre they look at
+    angle = np.median(np.arccos((camera * projector).sum(1))) * 250 / (250 - radius)
+    assert fit.ray_angle_deg == pytest.approx(np.degrees(angle), rel=0.1)
+    assert fit.depth_per_px == pytest.approx((240 - radius) / 190 / np.sin(angle), rel=0.15)
+
+
+def test_look_up_is_bilinear_between_pixel_centres() -> None:
+    image = np.array([[0.0, 1.0], [2.0, 4.0]])
+    uv = np.array([[0.5, 0.5], [1.5, 0.5], [1.0, 0.5], [1.0, 1.0], [0.0, 0.0], [np.nan, 0.5]])
+    np.testing.assert_allclose(look_up(image, uv), [0, 1, 0.5, 1.75, 0, np.nan])
+
+
+def test_large_frames_are_thinned_on_a_grid(clean_scan: Path) -> None:
+    scan = read_scan(clean_scan)
+    frame, surface = scan.frames[0], IndexedMesh(FacetedScan().truth())
+    args = (surface, frame, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector)
+    every, few = frame_pixels(*args), frame_pixels(*args, max_pixels=len(frame_pixels(*args).row) // 4 + 1)
+    assert (every.stride, few.stride) == (1, 2)
+    assert len(few.row) == pytest.approx(len(every.row) / 4, rel=0.1)
+    assert not (few.row % 2).any() and not (few.column % 2).any()
+
+
+def test_many_frames_are_evaluated_at_fewer_pixels_of_each(clean_scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert [most_pixels(frames) for frames in (1, 120, 1000)] == [MAX_PIXELS, MAX_PIXELS, 30_000]
+    scan, mesh, counts = read_scan(clean_scan), FacetedScan().truth(), []
+    every = evaluate(mesh, scan, scan.poses).agreement
+    monkeypatch.setattr("sl_nerfstudio.evaluation.agreement._ALL_PIXELS", 1500)
+    few = evaluate(
+        mesh, scan, scan.poses, on_frame=lambda frame, figures, pixels: counts.append(len(pixels.row))
+    ).agreement
+    assert len(counts) == 3 and all(200 < count <= 550 for count in counts)
+    for a, b in zip(every.frames, few.frames, strict=True):
+        assert b.pixels == pytest.approx(a.pixels, rel=0.1) and b.hit_share == a.hit_share == 1.0
+
+
+MADE = FacetedScan(mesh=blob(24))
+
+
+@pytest.fixture(scope="module")
+def fine_scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return MADE.write(tmp_path_factory.mktemp("holes") / "scan")
+
+
+def pixels_of(root: Path, mesh: Mesh) -> tuple[FramePixels, float]:
+    scan = read_scan(root)
+    frame, surface = scan.frames[0], IndexedMesh(mesh)
+    pixels = frame_pixels(surface, frame, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector)
+    return pixels, surface.diagonal
+
+
+def without(mesh: Mesh, centre: np.ndarray, radius: float) -> tuple[Mesh, np.ndarray]:
+    """The mesh without the triangles around a point, and which ones those were."""
+    lost = np.linalg.norm(mesh.vertices[mesh.faces].mean(1) - centre, axis=1) < radius
+    return Mesh(mesh.vertices, mesh.faces[~lost]), lost
+
+
+def test_the_whole_surface_has_no_holes(fine_scan: Path) -> None:
+    holes = find_holes(*pixels_of(fine_scan, MADE.truth()))
+    assert (holes.missing, holes.largest) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("radius", [8.0, 14.0])
+def test_a_hole_is_as_large_as_the_pixels_that_saw_what_is_missing(fine_scan: Path, radius: float) -> None:
+    """Rays through the hole meet the back of the object: they hit, but not where the frame measured."""
+    scan, truth = read_scan(fine_scan), MADE.truth()
+    whole, _ = pixels_of(fine_scan, truth)
+    towards = scan.frames[0].T_world_camera[:3, 3]
+    nearest = truth.vertices[np.argmax(truth.vertices @ towards)]
+    mesh, lost = without(truth, nearest, radius)
+    hits = IndexedMesh(truth).cast(*rays_of(fine_scan, whole))
+    expected = float(lost[hits.face[whole.decoded & whole.hit]].sum() / whole.decoded.sum())
+    holes = find_holes(*pixels_of(fine_scan, mesh))
+    assert expected > 0.01
+    assert holes.missing == pytest.approx(expected, rel=0.1)
+    assert 0.6 * expected < holes.largest <= holes.missing
+
+
+def rays_of(root: Path, pixels: FramePixels) -> tuple[np.ndarray, np.ndarray]:
+    """Camera rays by the pinhole's formula."""
+    frame = read_scan(root).frames[0]
+    c = frame.camera
+    x, y = (pixels.column + 0.5 - c.cx) / c.fl_x, -(pixels.row + 0.5 - c.cy) / c.fl_y
+    d = np.stack([x, y, -np.ones_like(x)], -1)
+    d = d / np.linalg.norm(d, axis=1, keepdims=True) @ frame.T_world_camera[:3, :3].T
+    return np.broadcast_to(frame.T_world_camera[:3, 3], d.shape), d
+
+
+def test_a_patch_that_was_mistaken_for_another_is_no_hole(fine_scan: Path) -> None:
+    """Its points lie in the air before the surface, on their epipolar curves, but it has a jump all around it."""
+    pixels, size = pixels_of(fine_scan, MADE.truth())
+    row, column = int(np.median(pixels.row)), int(np.median(pixels.column))
+    patch = (np.abs(pixels.row - row) < 3) & (np.abs(pixels.column - column) < 3)
+    wrong = replace(
+        pixels,
+        coords=np.where(patch[:, None], pixels.coords + 15.0, pixels.coords),
+        offset=np.where(patch[:, None], 15.0, pixels.offset),
+        behind=np.where(patch, 0.2 * size, pixels.behind),
+    )
+    assert patch.sum() < 0.03 * pixels.decoded.sum()
+    assert find_holes(wrong, size).largest == 0.0
+    continuous = replace(wrong, coords=pixels.coords)  # the same without the jump: surface is missing
+    assert find_holes(continuous, size).largest == pytest.approx(patch.sum() / pixels.decoded.sum())
+
+
+def test_narrow_gaps_along_the_rim_and_frames_without_pixels(fine_scan: Path) -> None:
+    pixels, size = pixels_of(fine_scan, MADE.truth())
+    rim = np.array([c == pixels.column[pixels.row == r].min() for r, c in zip(pixels.row, pixels.column, strict=True)])
+    holes = find_holes(replace(pixels, hit=pixels.hit & ~rim), size)
+    assert holes.missing > 0.01 and holes.largest == 0.0
+    nothing = find_holes(replace(pixels, decoded=np.zeros_like(pixels.decoded)), size)
+    assert (nothing.missing, nothing.largest) == (0.0, 0.0)

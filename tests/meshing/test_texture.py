@@ -1,0 +1,305 @@
+"""Colours of vertices and textures of a ball whose colour is a function of the place."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from scipy.ndimage import distance_transform_edt
+
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.numerics import component_labels
+from sl_nerfstudio.meshing import texture as module
+from sl_nerfstudio.meshing.files import files_of, read_mesh, write_mesh
+from sl_nerfstudio.meshing.finish import decimate
+from sl_nerfstudio.meshing.mesh import GREY, Charts, Mesh
+from sl_nerfstudio.meshing.texture import Textured, draw_triangles, square_charts, surface_texture, vertex_colours
+from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.scan.images import encode_png
+
+from .coloured_ball import BALL, PINHOLE, RADIUS, angle_cosines, colour_at, coloured_scan, picture
+
+
+@pytest.fixture(scope="module")
+def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    return coloured_scan(tmp_path_factory.mktemp("colour") / "scan", pictures=3)
+
+
+def test_vertices_have_the_colour_of_their_place_and_unseen_ones_are_grey(scan):
+    found = vertex_colours(BALL, scan, scan.poses)
+    assert found is not None and found.pictures == 3
+    cosine = angle_cosines(scan, range(3), BALL.vertices)
+    clearly = (cosine > 0.3).any(0)
+    assert found.seen[clearly].all() and not found.seen[(cosine < 0.1).all(0)].any()
+    expected = colour_at(BALL.vertices) * 255
+    assert np.abs(found.rgb[clearly] - expected[clearly]).max() < 5
+    assert (found.rgb[~found.seen] == GREY).all() and 0.2 < found.seen.mean() < 0.8
+
+
+def test_flat_views_weigh_less(scan):
+    """One picture is all white: its share in a vertex is its squared cosine."""
+    white = np.full((PINHOLE.h, PINHOLE.w), 255, dtype=np.uint8)
+    path = scan.root / "color/white.png"
+    path.write_bytes(encode_png(white))
+    first = replace(scan.frames[0], color_path=path)
+    found = vertex_colours(BALL, replace(scan, frames=(first, *scan.frames[1:2])), scan.poses[:2])
+    assert found is not None
+    squares = angle_cosines(scan, range(2), BALL.vertices) ** 2
+    both = (angle_cosines(scan, range(2), BALL.vertices) > 0.3).all(0)
+    share = squares[0] / squares.sum(0)
+    expected = 255 * (share[:, None] + (1 - share[:, None]) * colour_at(BALL.vertices))
+    assert both.sum() > 100 and np.abs(found.rgb[both] - expected[both]).max() < 5
+
+
+def test_what_is_hidden_takes_no_colour_from_what_hides_it(scan):
+    eye = scan.frames[0].T_world_camera[:3, 3]
+    plate = trimesh.creation.box((12.0, 12.0, 0.5))
+    plate.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], eye / np.linalg.norm(eye)))
+    plate.apply_translation(0.5 * eye)
+    vertices = np.concatenate([BALL.vertices, plate.vertices]).astype(np.float64)
+    faces = np.concatenate([BALL.faces, plate.faces + len(BALL.vertices)]).astype(np.int64)
+    alone = replace(scan, frames=scan.frames[:1])
+    open_view = vertex_colours(BALL, alone, scan.poses[:1])
+    found = vertex_colours(Mesh(vertices, faces), alone, scan.poses[:1])
+    assert open_view is not None and found is not None
+    behind = open_view.seen & ~found.seen[: len(BALL.vertices)]
+    ray = BALL.vertices - eye
+    off = np.linalg.norm(np.cross(ray, -eye / np.linalg.norm(eye)), axis=1) / np.linalg.norm(ray, axis=1)
+    assert behind.any() and (off[behind] < 0.06).all() and not (open_view.seen & (off < 0.036) & ~behind).any()
+    assert (found.rgb[: len(BALL.vertices)][behind] == GREY).all()
+
+
+def test_pictures_with_16_bits_and_a_scan_without_pictures(scan):
+    assert vertex_colours(BALL, replace(scan, frames=scan.frames[3:]), scan.poses[3:]) is None
+    path = scan.root / "color/deep.png"
+    path.write_bytes(encode_png(picture(scan.frames[0].T_world_camera).astype(np.uint16) * 257))
+    deep = replace(scan, frames=(replace(scan.frames[0], color_path=path),))
+    plain = replace(scan, frames=scan.frames[:1])
+    deep_found, found = (vertex_colours(BALL, s, scan.poses[:1]) for s in (deep, plain))
+    assert deep_found is not None and found is not None and np.array_equal(deep_found.rgb, found.rgb)
+
+
+CAMERA = Device(w=384, h=336, fl_x=900.0, fl_y=930.0, cx=180.0, cy=174.0)
+COARSE = decimate(BALL, 300)
+TOLERANCE = 0.02  # of full scale: half a grey value in each picture and the texture, bilinear values of both
+
+
+def waves(p: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1]: periods that the 300 triangles (12 mm) of COARSE cannot follow, but pictures (0.3 mm) can."""
+    x, y, z = np.moveaxis(p, -1, 0)
+    return 0.5 + 0.3 * np.stack(
+        [np.sin(x / 3) * np.cos(z / 5), np.sin(y / 4 + 1), np.cos((x - y) / 5) * z / RADIUS], -1
+    )
+
+
+@pytest.fixture(scope="module")
+def waving(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    return coloured_scan(tmp_path_factory.mktemp("texture") / "scan", 3, CAMERA, waves)
+
+
+@pytest.fixture(scope="module", params=["whole", "decimated"])
+def mesh(request) -> Mesh:
+    return BALL if request.param == "whole" else COARSE.mesh
+
+
+@pytest.fixture(scope="module")
+def textured(mesh, waving) -> Textured:
+    return surface_texture(mesh, 768, BALL, waving, waving.poses)
+
+
+def loaded(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, Image.Image]:
+    """What trimesh reads: corners of all triangles in the scan's axes, in mm, their texture coordinates, the image."""
+    found = trimesh.load_mesh(path, process=False)
+    corners, uv = found.triangles, found.visual.uv[found.faces]
+    material = found.visual.material
+    image = material.image if path.suffix == ".obj" else material.baseColorTexture
+    assert image is not None
+    if path.suffix == ".glb":  # metres, y up
+        x, y, z = np.moveaxis(corners, -1, 0)
+        corners = np.stack([x, -z, y], -1) * 1000
+    return np.asarray(corners), uv[..., 0], uv[..., 1], image
+
+
+def sampled(image: Image.Image, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Bilinear values in [0, 1] by trimesh, whose v is counted upwards for all formats."""
+    return trimesh.visual.color.uv_to_interpolated_color(np.stack([u, v], 1), image.convert("RGB"))[:, :3] / 255
+
+
+@pytest.mark.parametrize("where", ["inside triangles", "on their edges"])
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_the_texture_has_the_colour_of_the_place(suffix, where, mesh, textured, waving, tmp_path):
+    """Edges include the borders of all charts, where filters of the texture read beside the chart."""
+    path = tmp_path / f"a ball{suffix}"
+    write_mesh(path, mesh, None, "mm", textured.texture)
+    corners, u, v, image = loaded(path)
+    random = np.random.default_rng(3)
+    weights = random.dirichlet([1, 1, 1], (len(corners), 20))
+    if where == "on their edges":
+        weights[..., 2] = 0
+        weights = np.take_along_axis(weights / weights.sum(-1, keepdims=True), random.permuted(
+            np.broadcast_to(np.arange(3), weights.shape), axis=-1), -1)  # fmt: skip
+    p = np.einsum("fnk,fki->fni", weights, corners).reshape(-1, 3)
+    found = sampled(image, *(np.einsum("fnk,fk->fn", weights, x).reshape(-1) for x in (u, v)))
+    p *= RADIUS / np.linalg.norm(p, axis=1, keepdims=True)
+    cosine = angle_cosines(waving, range(3), p)
+    clearly = (cosine > 0.4).any(0) & ~((cosine > 0.1) & (cosine < 0.3)).any(0)
+    error = np.abs(found - waves(p))[clearly]
+    assert clearly.sum() > 0.3 * len(p) > 1000
+    assert np.percentile(error, 99) < TOLERANCE and error.max() < 3 * TOLERANCE
+    unseen = (cosine < 0.1).all(0)
+    assert unseen.any() and np.abs(found[unseen] - GREY / 255).max() < 0.003
+
+
+def test_smaller_copies_of_the_image_show_nothing_from_between_the_charts(mesh, textured):
+    """Reduced eight times, as for a distant view, every pixel is still a mean of colours of the ball: none is black."""
+    image = textured.texture.image.astype(float)
+    small = image.reshape(96, 8, 96, 8, 3).mean((1, 3)) / 255
+    assert small.min() > 0.19 and small.max() < 0.81
+    assert image.min() / 255 > 0.19 and image.max() / 255 < 0.81
+
+
+def test_figures_of_a_texture(mesh, textured):
+    """The side of a pixel: as many of them as are inside triangles have the area of the surface."""
+    assert textured.pictures == 3 and 0.4 < textured.seen < 0.9
+    uv = textured.texture.charts.uv[textured.texture.charts.corners].astype(float) * 768
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    pixels = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
+    area = trimesh.Trimesh(mesh.vertices, mesh.faces).area
+    assert textured.texel == pytest.approx((area / pixels) ** 0.5, rel=1e-6)
+
+
+def test_parts_of_a_texture_are_coloured_like_the_whole(waving, mesh, textured, monkeypatch):
+    monkeypatch.setattr(module, "_AT_A_TIME", 50_000)
+    assert np.array_equal(surface_texture(mesh, 768, BALL, waving, waving.poses).texture.image, textured.texture.image)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_the_mesh_itself_comes_back_without_the_seams_of_its_charts(suffix, mesh, textured, tmp_path):
+    path = tmp_path / f"m{suffix}"
+    write_mesh(path, mesh, None, "mm", textured.texture)
+    assert set(tmp_path.iterdir()) == set(files_of(path, textured=True))
+    back = read_mesh(path, "mm")
+    assert len(back.vertices) == len(mesh.vertices) and len(back.faces) == len(mesh.faces) and back.is_closed()
+    np.testing.assert_allclose(np.sort(back.vertices, axis=0), np.sort(mesh.vertices, axis=0), atol=2e-5)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".stl"])
+def test_formats_without_textures(suffix, mesh, textured, tmp_path):
+    with pytest.raises(ValueError, match=f"{suffix} files have no texture"):
+        write_mesh(tmp_path / f"m{suffix}", mesh, None, "mm", textured.texture)
+    assert list(tmp_path.iterdir()) == []
+
+
+KNOT = trimesh.creation.torus(30.0, 11.0, major_sections=48, minor_sections=24)
+BOX = trimesh.creation.box((30, 20, 10)).subdivide_to_size(4.0)
+SOLIDS = {"torus": KNOT, "box": BOX}
+
+
+def mesh_of(solid: trimesh.Trimesh, scale: float = 1.0) -> Mesh:
+    return Mesh(np.asarray(solid.vertices, dtype=float) * scale, np.asarray(solid.faces, dtype=np.int64))
+
+
+def drawn(charts: Charts, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """How many triangles the centre of each pixel is inside of, and the chart there; -1 where there is none."""
+    number = component_labels(charts.corners[:, :2].ravel(), charts.corners[:, 1:].ravel(), len(charts.uv))
+    count, chart = np.zeros((size, size), int), np.full((size, size), -1)
+    for triangle in charts.corners:
+        corners = charts.uv[triangle].astype(float) * size
+        (left, top), (right, bottom) = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
+        x, y = np.meshgrid(np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5)
+        sides = [
+            (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
+            for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)
+        ]
+        inside = (np.array(sides) > 1e-4).all(0) | (np.array(sides) < -1e-4).all(0)
+        count[top:bottom, left:right] += inside
+        chart[top:bottom, left:right][inside] = number[triangle[0]]
+    return count, chart
+
+
+def areas(points: np.ndarray) -> np.ndarray:
+    """Of triangles (f, 3, 2 or 3), by Heron's formula."""
+    a, b, c = (np.linalg.norm(points[:, k] - points[:, k - 1], axis=1) for k in range(3))
+    s = (a + b + c) / 2
+    return np.sqrt(np.maximum(s * (s - a) * (s - b) * (s - c), 0))
+
+
+@pytest.mark.parametrize("pieces", ["whole", "in pieces"])
+@pytest.mark.parametrize("name", SOLIDS)
+def test_charts_lie_inside_the_square_and_not_over_each_other(name, pieces, monkeypatch):
+    monkeypatch.setattr(module, "_PIECE", 700 if pieces == "in pieces" else 10**9)
+    mesh, size = mesh_of(SOLIDS[name]), 512
+    charts = square_charts(mesh, size)
+    assert charts.uv.min() >= 0 and charts.uv.max() <= 1
+    assert np.array_equal(charts.vertex[charts.corners], mesh.faces)
+    count, chart = drawn(charts, 2 * size)
+    flat = areas(charts.uv[charts.corners].astype(float))
+    assert count.max() == 1 and count.mean() == pytest.approx(flat.sum(), rel=0.02)
+    assert 0.25 < flat.sum() < 1 and (flat > 0).all()
+    # every triangle at about the same scale
+    scale = np.sqrt(flat / areas(mesh.vertices[mesh.faces]))
+    assert np.percentile(scale, 99) / np.percentile(scale, 1) < 1.5
+    # two pixels of the texture between charts, so that a filter of two by two pixels never sees another one
+    for one in np.unique(chart[chart >= 0])[:20]:
+        away = distance_transform_edt(chart != one)
+        assert away[(chart >= 0) & (chart != one)].min() >= 2 * 2
+    assert len(np.unique(chart[chart >= 0])) == charts.count
+
+
+def test_the_unit_and_the_place_of_a_mesh_do_not_matter():
+    plain, tiny = (square_charts(mesh_of(KNOT, scale), 256) for scale in (1.0, 1e-5))
+    far = square_charts(Mesh(mesh_of(KNOT).vertices + 1e4, mesh_of(KNOT).faces), 256)
+    for other in (tiny, far):
+        assert np.array_equal(plain.corners, other.corners)
+        np.testing.assert_allclose(plain.uv, other.uv, atol=0.02)
+
+
+def test_a_small_texture_has_few_charts():
+    counts = [square_charts(mesh_of(KNOT), size).count for size in (64, 512)]
+    assert counts[0] < 30 < counts[1]
+
+
+def weights_of(corners, p):
+    """Barycentric weights by solving the linear system."""
+    return np.linalg.solve(np.vstack([corners.T, np.ones(3)]), np.append(p, 1.0))
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0)], ids=["clockwise", "anticlockwise"])
+def test_pixels_of_a_triangle_have_its_weights_and_its_gutter_is_two_pixels_wide(order):
+    size = 40
+    corners = np.array([[0.2, 0.25], [0.8, 0.3], [0.45, 0.9]])[list(order)]
+    triangle, weights = draw_triangles(corners[None], size)
+    beside = []
+    for row in range(size):
+        for column in range(size):
+            p = np.array([column + 0.5, row + 0.5]) / size
+            expected = weights_of(corners, p)
+            if expected.min() >= 0:
+                assert triangle[row, column] == 0
+            if triangle[row, column] == 0:
+                np.testing.assert_allclose(weights[row, column], expected, atol=1e-4)
+                edges = [(corners[(k + 1) % 3], corners[(k + 2) % 3]) for k in range(3)]
+                height = [
+                    abs(np.cross(b - a, corners[k] - a)) / np.linalg.norm(b - a) for k, (a, b) in enumerate(edges)
+                ]
+                beside.append(max(0.0, *(-expected * height * size)))
+    assert 1.0 < max(beside) <= 2.0 + 1e-6
+
+
+def test_a_pixel_inside_one_triangle_is_not_taken_by_the_gutter_of_another():
+    first, second = [[0.0, 0.0], [0.5, 0.0], [0.0, 1.0]], [[0.5, 0.0], [0.5, 1.0], [0.0, 1.0]]
+    for pair in ([first, second], [second, first]):
+        corners = np.array(pair)
+        triangle, weights = draw_triangles(corners, 16)
+        inside = weights.min(-1) >= 0
+        for row, column in zip(*np.nonzero(triangle >= 0), strict=True):
+            p = np.array([column + 0.5, row + 0.5]) / 16
+            if any(weights_of(c, p).min() >= 0 for c in corners):
+                assert inside[row, column]
+
+
+def test_degenerate_triangles_cover_nothing():
+    corners = np.array([[[0.1, 0.1], [0.5, 0.5], [0.9, 0.9]], [[0.3, 0.3]] * 3])
+    assert (draw_triangles(corners, 8)[0] == -1).all()

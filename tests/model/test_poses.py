@@ -1,0 +1,180 @@
+"""Poses as parameters: increments, derivatives, other base poses, and what each choice keeps fixed."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
+from sl_nerfstudio.geometry.lie import exp_se3, inverse
+from sl_nerfstudio.model.model import SLModelConfig, pose_parameters
+from sl_nerfstudio.model.poses import PoseParameters
+
+FRAMES = 3
+KINDS = [
+    {},
+    {"shared_projector": True},
+    {"projector_moves_by": "own pose", "about_scene": False},
+    {"about_scene": False},
+    {"projector_moves_by": "nothing", "refine_projector": False},
+]
+ALL_KINDS = pytest.mark.parametrize("kind", KINDS)
+
+
+def random_poses(seed: int) -> torch.Tensor:
+    return exp_se3(torch.randn(FRAMES, 6, generator=torch.Generator().manual_seed(seed), dtype=torch.float64))
+
+
+def make(**kind: Any) -> PoseParameters:
+    return PoseParameters(random_poses(0), random_poses(1), refine=True, **kind).double()
+
+
+def set_steps(poses: PoseParameters, seed: int = 2) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for step in (poses.camera_step, poses.projector_step):
+            step.copy_(0.1 * torch.randn(step.shape, generator=generator, dtype=torch.float64))
+
+
+def test_a_rig_moves_as_a_whole_about_the_scene_and_its_projector_relative_to_the_camera():
+    poses = make()
+    set_steps(poses)
+    camera, projector = poses()
+    delta, rho = exp_se3(poses.camera_step), exp_se3(poses.projector_step)
+    assert torch.allclose(camera, delta @ random_poses(0), atol=1e-13)
+    assert torch.allclose(inverse(camera) @ projector, rho @ inverse(random_poses(0)) @ random_poses(1), atol=1e-13)
+
+
+def test_a_static_projector_stays_while_its_cameras_turn_about_the_scene():
+    poses = make(projector_moves_by="nothing", refine_projector=False)
+    set_steps(poses)
+    camera, projector = poses()
+    assert torch.equal(projector, random_poses(1))
+    assert torch.allclose(camera, exp_se3(poses.camera_step) @ random_poses(0), atol=1e-12)
+
+
+def test_independent_devices_turn_about_themselves():
+    poses = make(projector_moves_by="own pose", about_scene=False)
+    with torch.no_grad():
+        poses.camera_step[:, 3:] = 0.2
+        poses.projector_step[0, 0] = 0.3
+    camera, projector = poses()
+    assert torch.allclose(camera[:, :3, 3], random_poses(0)[:, :3, 3], atol=1e-14)
+    moved = (inverse(random_poses(1)) @ projector)[0, :3, 3]
+    assert torch.allclose(moved, torch.tensor([0.3, 0.0, 0.0], dtype=torch.float64), atol=1e-14)
+    assert torch.allclose(projector[1:], random_poses(1)[1:], atol=1e-14)
+
+
+@ALL_KINDS
+def test_gradients_are_central_differences(kind):
+    poses = make(**kind)
+    set_steps(poses)
+    weight = torch.randn(2, FRAMES, 4, 4, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+    def value() -> torch.Tensor:
+        return (torch.stack(poses()) * weight).sum()
+
+    value().backward()
+    for step in (step for step in poses.parameters() if step.requires_grad):
+        expected = torch.zeros_like(step)
+        for i in range(step.numel()):
+            with torch.no_grad():
+                flat = step.view(-1)
+                flat[i] += 1e-6
+                plus = value()
+                flat[i] -= 2e-6
+                expected.view(-1)[i] = (plus - value()) / 2e-6
+                flat[i] += 1e-6
+        assert step.grad is not None and torch.allclose(step.grad, expected, atol=1e-7)
+
+
+@ALL_KINDS
+def test_continuing_from_other_poses(kind):
+    poses = make(**kind)
+    set_steps(poses)
+    poses.rebase(random_poses(5), random_poses(6))
+    camera, projector = poses()
+    assert camera.dtype == projector.dtype == torch.float64
+    assert torch.allclose(camera, random_poses(5), atol=1e-14) and torch.allclose(
+        projector, random_poses(6), atol=1e-14
+    )
+    assert not poses.camera_step.any() and not poses.projector_step.any()
+    assert torch.equal(poses.start_camera, random_poses(0)) and torch.equal(poses.start_projector, random_poses(1))
+
+
+def test_a_shared_projector_moves_alike_in_all_frames():
+    poses = make(shared_projector=True)
+    assert poses.projector_step.shape == (1, 6)
+    set_steps(poses)
+    camera, projector = poses()
+    relative = inverse(camera) @ projector
+    moved = relative @ inverse(inverse(random_poses(0)) @ random_poses(1))
+    assert torch.allclose(moved, exp_se3(poses.projector_step).expand(FRAMES, 4, 4), atol=1e-13)
+
+
+@ALL_KINDS
+def test_a_checkpoint_restores_base_start_and_increments(kind):
+    poses = make(**kind)
+    poses.rebase(random_poses(5), random_poses(6))
+    set_steps(poses)
+    other = PoseParameters(random_poses(8), random_poses(9), refine=True, **kind).double()
+    other.load_state_dict(poses.state_dict())
+    assert all(torch.equal(a, b) for a, b in zip(poses(), other(), strict=True))
+    assert torch.equal(other.start_camera, random_poses(0)) and other.sigma.isnan().all()
+
+
+METHODS = ("adjust", "render", "render-independently")
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("free", ["free", "rigid-rig", "known-rig", "static-projector", "off"])
+def test_every_choice_moves_what_it_says_and_keeps_the_rest_fixed(free, method):
+    """One choice of what is free and one of how it is refined: no combination contradicts itself."""
+    settings = SLModelConfig(refine_poses=free, pose_method=method)
+    start, light = random_poses(0), random_poses(1)
+    poses = pose_parameters(settings, start, light).double()
+    moves = free != "off" and method != "adjust"
+    assert settings.renders_poses == moves and settings.adjusts_poses == (free != "off" and method == "adjust")
+    assert poses.camera_step.requires_grad == moves
+    assert poses.projector_step.requires_grad == (moves and free in ("free", "rigid-rig"))
+    generator = torch.Generator().manual_seed(4)
+    with torch.no_grad():  # one step of any optimiser moves what has a gradient
+        for step in (p for p in poses.parameters() if p.requires_grad):
+            step.copy_(0.1 * torch.randn(step.shape, generator=generator, dtype=torch.float64))
+    camera, projector = poses()
+    before, after = inverse(start) @ light, inverse(camera) @ projector
+    assert torch.allclose(camera, start, atol=1e-12) == (not moves)
+    if free == "static-projector":
+        assert torch.allclose(projector, light, atol=1e-12)
+    elif free in ("known-rig", "off") or not moves:
+        assert torch.allclose(after, before, atol=1e-12)
+    elif free == "rigid-rig":
+        change = after @ inverse(before)
+        assert torch.allclose(change, change[:1].expand_as(change), atol=1e-12)
+        assert not torch.allclose(change[0], torch.eye(4, dtype=torch.float64), atol=1e-3)
+    else:
+        assert (after - before).abs().flatten(1).amax(1).min() > 1e-3  # every frame's own
+
+
+def test_results_of_the_adjustment_are_saved_with_the_poses():
+    poses = make()
+    assert poses.self_calibration() is None
+    sigma, found = torch.rand(FRAMES, 12), SelfCalibration(torch.rand(6).double(), torch.eye(6).double())
+    factor = torch.randn(12 * FRAMES + 6, 12 * FRAMES + 6).double()
+    assert poses.joint_covariance() is None
+    poses.note(sigma, factor, found)
+    other = make()
+    other.load_state_dict(poses.state_dict())
+    kept = other.self_calibration()
+    assert (
+        kept is not None and torch.equal(kept.change, found.change) and torch.equal(kept.covariance, found.covariance)
+    )
+    assert torch.equal(other.sigma, sigma.double())
+    both = other.joint_covariance()
+    assert both is not None and np.array_equal(both.factor, factor.numpy())
+    poses.note(sigma, torch.cat([factor, factor[:, :4]], 1), found)  # with the columns of other minima, say
+    more = poses.joint_covariance()
+    assert more is not None and more.factor.shape == factor.shape
+    wanted = factor @ factor.T + factor[:, :4] @ factor[:, :4].T
+    np.testing.assert_allclose(more.matrix, wanted.numpy(), atol=1e-9)

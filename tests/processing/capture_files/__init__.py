@@ -1,1 +1,0 @@
-"""Tests of captures as people have them."""

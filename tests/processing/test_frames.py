@@ -1,0 +1,290 @@
+"""The frame stage: decoding, resuming, frames that fail, and workers that end with their parent."""
+
+import io
+import json
+import mmap
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import weakref
+from contextlib import redirect_stdout
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.cli.process import main
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.processing import frames, records
+from sl_nerfstudio.processing.captures import find_captures
+from sl_nerfstudio.processing.frames import FrameWorker, clouds_of, describe_frame_stage, run_frame_stage, run_frames
+from sl_nerfstudio.processing.records import digest
+from sl_nerfstudio.scan import check_scan, read_scan
+from sl_nerfstudio.scan.images import encode_png
+from sl_nerfstudio.storage import in_file
+from tests.decoding.ramps_decoder import RampsDecoder
+from tests.processing.conftest import register_ramps
+from tests.processing.ramp_scan import LAYOUT, NAMES, RampScan
+
+
+class KilledDecoder(RampsDecoder):
+    """As if the system had run out of memory."""
+
+    def decode(self, paths):
+        os._exit(9)
+
+
+@pytest.fixture
+def copy(ramp_scan, tmp_path):
+    """Captures that a test may spoil."""
+    shutil.copytree(ramp_scan.root, tmp_path / "c")
+    return RampScan(tmp_path / "c", *list(vars(ramp_scan).values())[1:])
+
+
+def _found(scan):
+    return find_captures(scan.root / "images", True)
+
+
+def _run_command(scan, out, most_in_memory):
+    """The command, with so much memory for clouds; what it said, and whether it wrote clouds to a file."""
+    written, said = [], io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said):
+        register_ramps(patch)
+        patch.setattr(records, "in_file", lambda arrays: written.append(len(arrays)) or in_file(arrays))
+        patch.setattr(records, "largest_in_memory", lambda: most_in_memory)
+        patch.setattr(sys, "argv", ["sl-process", *scan.flags(out)])
+        main()
+    return said.getvalue(), bool(written)
+
+
+@pytest.fixture(scope="module")
+def whole(ramp_scan, tmp_path_factory):
+    """The scan of the command, with all clouds in memory, and what it said."""
+    out = tmp_path_factory.mktemp("whole") / "scan"
+    said, written = _run_command(ramp_scan, out, 10**9)
+    assert not written
+    return out, said
+
+
+@pytest.mark.slow
+def test_a_third_decoder_goes_all_the_way_to_a_scan(whole, ramp_scan):
+    out, said = whole
+    assert "decoder ramps" in said
+    assert check_scan(out) == []
+    scan = read_scan(out)
+    assert [frame.name for frame in scan.frames] == list(NAMES)
+    for frame, exact in zip(scan.frames, ramp_scan.coords, strict=True):
+        coords = frame.read_coords()
+        both = np.isfinite(coords).all(-1) & np.isfinite(exact).all(-1)
+        assert both.sum() > 0.99 * np.isfinite(exact).all(-1).sum()
+        assert np.abs(coords[both] - exact[both]).max() < 800 / 65535
+    assert json.loads((out / "pattern.json").read_text())["kind"] == "ramps"
+    np.testing.assert_allclose(scan.read_pattern(), LAYOUT.render(), atol=0.6 / 255)
+    document = json.loads((out / "processing.json").read_text())
+    assert document["decoder"] == "ramps"
+    assert [frame["decode_rate"] for frame in document["frames"]] == [1.0] * 4
+
+
+def test_results_say_how_much_was_decoded_and_come_from_the_store_the_second_time(ramp_scan, tmp_path):
+    config, job, captures = ramp_scan.config(tmp_path / "s"), ramp_scan.job(tmp_path / "w"), _found(ramp_scan)
+    first = run_frame_stage(config, job, captures)
+    second = run_frame_stage(config, job, captures)
+    assert [r.name for r in first] == [r.name for r in second] == list(NAMES)
+    for a, b, exact in zip(first, second, ramp_scan.coords, strict=True):
+        assert not a.resumed and b.resumed and a.key == b.key and a.stage == b.stage == ""
+        assert a.decode_rate == b.decode_rate == 1
+        assert a.mask_share == pytest.approx(np.isfinite(exact).all(-1).mean(), abs=1e-3)
+        np.testing.assert_array_equal(a.cloud.coords, b.cloud.coords)
+        np.testing.assert_array_equal(a.cloud.pose.T_camera_projector, b.cloud.pose.T_camera_projector)
+    assert describe_frame_stage(first).startswith("decoded and calibrated 4 of 4 frames: 100% of the pattern, epipolar")
+    assert "4 of 4 frames (4 had been decoded before): 100%" in describe_frame_stage(second)
+    frames = json.loads((tmp_path / "w" / "manifest.json").read_text())["frames"]
+    assert {name: frame["status"] for name, frame in frames.items()} == dict.fromkeys(NAMES, "decoded before")
+
+
+def test_a_changed_image_is_decoded_again(copy, tmp_path):
+    worker, frame = FrameWorker(copy.job(tmp_path / "w")), _found(copy).frames[0]
+    first = worker(frame)
+    frame.images[0].write_bytes(frame.images[0].read_bytes() + b" ")
+    again = worker(frame)
+    assert again.key != first.key and not again.resumed and worker(frame).resumed
+
+
+def test_frames_that_fail_are_named_with_their_file_and_the_others_go_on(copy, tmp_path):
+    images = copy.root / "images"
+    (images / NAMES[0] / "0.png").write_bytes(b"broken")
+    (images / NAMES[1] / "1.png").unlink()
+    (images / NAMES[2] / "0.png").write_bytes(encode_png(np.zeros((130, 130), np.uint16)))
+    speckled = np.zeros((130, 130), np.uint16)
+    speckled[60:63, 60:64] = 30000
+    (images / NAMES[3] / "0.png").write_bytes(encode_png(speckled))
+    job = copy.job(tmp_path / "w")
+    results = run_frame_stage(copy.config(tmp_path / "s"), job, _found(copy))
+    assert [r.stage for r in results] == ["reading", "decoding", "decoding", "calibrating"]
+    assert clouds_of(results) == []
+    assert f"{NAMES[0]}/0.png: is not an image that can be read" in results[0].reason
+    assert results[1].reason.startswith(f"{images / NAMES[1]}: holds 1 images, not 2\n    cause:  some are missing")
+    assert results[2].reason.startswith(f"{images / NAMES[2]}: is black")
+    assert results[3].reason.startswith(f"{images / NAMES[3]}: 12 decoded pixels are too few")
+    assert all("cause:" in r.reason and "remedy:" in r.reason for r in results)
+    assert results[3].key and not results[1].key
+    assert describe_frame_stage(results) == "decoded and calibrated 0 of 4 frames"
+    frames = json.loads((tmp_path / "w" / "manifest.json").read_text())["frames"]
+    assert {name: frame["status"] for name, frame in frames.items()} == {
+        NAMES[1]: "failed in decoding", NAMES[2]: "failed in decoding", NAMES[3]: "failed in calibrating",
+    }  # fmt: skip
+
+
+def test_decoded_frames_that_were_removed_are_an_error(ramp_scan, tmp_path):
+    worker = FrameWorker(ramp_scan.job(tmp_path / "w"))
+    result = worker(_found(ramp_scan).frames[1])
+    assert worker.load(result).rate == 1
+    shutil.rmtree(tmp_path / "w")
+    with pytest.raises(UserError, match=f"the decoded frame {NAMES[1]} is missing\n.*cause:.*\n.*remedy: start again"):
+        worker.load(result)
+
+
+@pytest.mark.slow
+def test_several_processes_give_the_same_and_one_that_is_killed_is_explained(ramp_scan, tmp_path):
+    captures = _found(ramp_scan)
+    results = {r.name: r for r in run_frames(ramp_scan.job(tmp_path / "two"), captures.frames, 2)}
+    alone = FrameWorker(ramp_scan.job(tmp_path / "one"))
+    for frame in captures.frames:
+        expected = alone(frame)
+        assert results[frame.name].key == expected.key
+        assert digest(results[frame.name].cloud) == digest(expected.cloud)
+    job = ramp_scan.job(tmp_path / "killed")
+    killed = type(job)(job.work, KilledDecoder(LAYOUT), job.camera, job.projector, job.seed)
+    with pytest.raises(UserError, match=r"was killed\n.*cause:  2 processes need more memory.*\n.*--jobs"):
+        list(run_frames(killed, captures.frames, 2))
+
+
+@pytest.mark.slow
+def test_results_of_other_processes_do_not_stay_in_memory(ramp_scan, tmp_path):
+    """The caller moves clouds to a file once they are many: then nobody else may hold them."""
+    gone = []
+    for result in run_frames(ramp_scan.job(tmp_path), _found(ramp_scan).frames, 2):
+        assert all(earlier() is None for earlier in gone[:-1])  # the last one waits in its future for the next
+        gone.append(weakref.ref(result.cloud))
+        del result
+    assert len(gone) == len(NAMES) and all(cloud() is None for cloud in gone)
+
+
+def _bytes_of(folder):
+    """Of all files but those that state times and paths."""
+    found = {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {name: content for name, content in found.items() if name.startswith(("coords", "mask", "transforms"))}
+
+
+@pytest.mark.slow
+def test_clouds_that_do_not_fit_into_memory_give_the_same_scan(monkeypatch, whole, ramp_scan, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    assert _run_command(ramp_scan, tmp_path / "scan", 0)[1]
+    found, expected = _bytes_of(tmp_path / "scan"), _bytes_of(whole[0])
+    assert len(found) == 2 * len(NAMES) + 1 and found == expected
+
+
+def test_clouds_stay_in_memory_up_to_a_limit(ramp_scan, tmp_path):
+    worker = FrameWorker(ramp_scan.job(tmp_path))
+    clouds = clouds_of([worker(frame) for frame in _found(ramp_scan).frames])
+    size = sum(array.nbytes for array in (clouds[0].points, clouds[0].coords))
+    kept = records.LargeClouds(6 * size)
+    same = [kept.kept(cloud) for cloud in clouds]
+    assert digest(tuple(same)) == digest(tuple(clouds))
+    assert not _mapped(same[0].points) and _mapped(same[-1].points) and _mapped(same[-1].pose.noise_px)
+
+
+def _mapped(array):
+    while array is not None and not isinstance(array, mmap.mmap):
+        array = getattr(array, "base", None)
+    return array is not None
+
+
+_PARENT = """
+import os, time
+from concurrent.futures import as_completed
+from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.processing.frames import no_interrupts, worker_pool
+
+def begin(word):
+    print(word, os.getpid(), flush=True)
+
+def work(_):
+    time.sleep(120)
+
+def main():
+    with worker_pool(2, begin, "worker") as pool:
+        with no_interrupts():
+            futures = [pool.submit(work, k) for k in range(5)]
+        for future in as_completed(futures):
+            future.result()
+
+if __name__ == "__main__":
+    run(main)
+"""
+
+
+@pytest.fixture
+def busy(tmp_path):
+    """A parent with two workers at work, in a process group of their own, and the numbers of the workers."""
+    script = tmp_path / "parent.py"
+    script.write_text(_PARENT)
+    process = subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )  # fmt: skip
+    workers = [int(process.stdout.readline().split()[1]) for _ in range(2)]
+    yield process, workers
+    process.kill()
+    process.communicate()
+
+
+def _running(process):
+    """Whether a process is there and no zombie."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def _all_end(workers):
+    end = time.monotonic() + 60
+    while any(map(_running, workers)) and time.monotonic() < end:
+        time.sleep(0.02)
+    return not any(map(_running, workers))
+
+
+@pytest.mark.slow
+def test_workers_end_when_their_parent_is_killed(busy):
+    parent, workers = busy
+    parent.kill()
+    assert _all_end(workers)
+    assert "Traceback" not in "".join(parent.communicate())  # Python's own tracker may warn of what it released
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "to_all", "status", "said"),
+    [(signal.SIGINT, True, 130, "interrupted\n"), (signal.SIGTERM, False, 143, "terminated\n")],
+)
+def test_a_signal_ends_the_workers_and_only_the_parent_speaks(busy, number, to_all, status, said):
+    """Control-C in a terminal reaches the workers, too."""
+    parent, workers = busy
+    (os.killpg if to_all else os.kill)(parent.pid, number)
+    assert parent.communicate(timeout=100) == ("", said) and parent.returncode == status
+    assert _all_end(workers)
+
+
+@pytest.mark.parametrize(
+    "megapixels, gigabytes, expected",
+    [(0.36, 64, 16), (0.36, 8, 3), (12.2, 16, 3), (12.2, 64, 13), (24, 32, 4), (0.36, 2, 1), (50, 4, 1)],
+)
+def test_no_more_processes_are_started_than_there_is_memory_for(monkeypatch, megapixels, gigabytes, expected):
+    monkeypatch.setattr(frames, "cores", lambda: 16)
+    found = frames.default_processes(int(megapixels * 1e6), gigabytes * 10**9)
+    assert found == expected
+    assert found == 1 or found * (1.4 + 0.2 * megapixels) + 1 < gigabytes

@@ -1,0 +1,120 @@
+"""Rough poses and cameras: read, refined and checked before the long work."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sl_nerfstudio.calibration.stated import CameraStart
+from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.processing.captures import find_captures
+from sl_nerfstudio.processing.frames import FrameWorker
+from sl_nerfstudio.processing.inputs import (
+    GivenPoses,
+    align_to,
+    read_cameras,
+    read_given_poses,
+    refine_camera,
+    require_intrinsics,
+)
+
+AT_PLACE, TURNED = np.eye(4).tolist(), np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
+
+
+def _poses(n=3, seed=0):
+    rng = np.random.default_rng(seed)
+    T = np.tile(np.eye(4), (n, 1, 1))
+    for k in range(n):
+        Q = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        T[k, :3, :3] = Q * np.sign(np.linalg.det(Q))
+        T[k, :3, 3] = rng.uniform(-100, 100, 3)
+    return T
+
+
+def _write(path, frames, **extra):
+    records = [{"file_path": f"images/{name}.png", "transform_matrix": T} for name, T in frames.items()]
+    path.write_text(json.dumps({"frames": records, **extra}))
+    return path
+
+
+def test_frames_are_matched_by_name(tmp_path):
+    T = _poses()
+    path = _write(tmp_path / "t.json", {"c": T[2].tolist(), "a": T[0].tolist(), "x": "not read"}, units="mm")
+    given = read_given_poses(path, ["a", "b", "c"])
+    np.testing.assert_array_equal(given.T_world_camera[[0, 2]], T[[0, 2]])
+    assert np.isnan(given.T_world_camera[1]).all() and given.units == "mm"
+    assert given.chosen([True, False, True]).T_world_camera.shape == (2, 4, 4)
+
+
+@pytest.mark.parametrize("count", [2, 5])
+def test_alignment_recovers_axes_and_scale(count):
+    T = _poses(count)
+    registered = np.ones(count, dtype=bool)
+    given = GivenPoses(T.copy(), "mm")
+    if count > 2:
+        given.T_world_camera[1] = np.nan
+        registered[2] = False
+    turned = np.linalg.inv(T[0]) @ T
+    turned[:, :3, 3] *= 0.01
+    turned[~registered] = np.nan
+    S = align_to(given, turned, registered)
+    both = registered & np.isfinite(given.T_world_camera).all((1, 2))
+    np.testing.assert_allclose(S.poses(turned[both]), T[both], atol=1e-8)
+    assert S.scale == pytest.approx(100)
+
+
+@pytest.mark.parametrize(
+    ("frames", "extra", "message"),
+    [
+        ({"a": np.eye(4).tolist()}, {}, "has poses for fewer than two of the captures"),
+        ({"a": (2 * np.eye(4)).tolist(), "b": np.eye(4).tolist()}, {}, "a: transform_matrix"),
+        (
+            {"a": AT_PLACE, "b": TURNED},
+            {},
+            "has all captures at the same place\n.*cause:  the file holds rotations only",
+        ),
+        *(({"a": AT_PLACE, "b": AT_PLACE}, {"units": u}, "units is") for u in ("furlong", ["mm"], {}, 1, True)),
+    ],
+)
+def test_faulty_poses(tmp_path, frames, extra, message):
+    path = _write(tmp_path / "t.json", frames, **extra)
+    with pytest.raises(UserError, match=message) as caught:
+        read_given_poses(path, ["a", "b", "c"])
+    assert "cause:" in str(caught.value) and "remedy:" in str(caught.value)
+
+
+def test_the_camera_is_refined_and_its_uncertainty_stated(ramp_scan, tmp_path):
+    true = ramp_scan.camera
+    rough = replace(true, fl_x=1.04 * true.fl_x, fl_y=1.04 * true.fl_y, cx=true.w / 2, cy=true.h / 2)
+    job = replace(ramp_scan.job(tmp_path / "w"), camera=rough)
+    captures = find_captures(ramp_scan.root / "images", True)
+    results = [FrameWorker(job)(frame) for frame in captures.frames[:2]]
+    log = []
+    refined, again, notes = refine_camera(job, results, CameraStart(rough, 0.04, "26 mm"), log.append)
+    assert refined.camera.fl_x == pytest.approx(true.fl_x, rel=2e-3)
+    assert all(result.cloud.camera == refined.camera for result in again)
+    figures = notes.document()
+    assert figures["px"] == refined.camera.fl_x and 0 < figures["sigma_px"] < 0.01 * true.fl_x
+    assert figures["start_sigma_px"] == pytest.approx(0.04 * rough.fl_x) and json.dumps(figures)
+    assert log == [notes.sentence()] and "± 4 % from EXIF (26 mm); with all frames" in log[0]
+
+
+def test_a_file_with_the_projector_alone_needs_photographs_that_state_the_focal_length(ramp_scan, tmp_path):
+    document = json.loads((ramp_scan.root / "intrinsics.json").read_text())
+    path = tmp_path / "projector.json"
+    path.write_text(json.dumps({"projector": document["projector"]}))
+    captures = find_captures(ramp_scan.root / "images", True)
+    config = ramp_scan.config(tmp_path / "s")
+    assert read_cameras(config, captures).first == ramp_scan.camera and not read_cameras(config, captures).several
+    with pytest.raises(UserError, match="does not say with which focal length it was taken, and no file gives"):
+        read_cameras(replace(config, intrinsics=path), captures)
+    with pytest.raises(UserError, match=r"--intrinsics: no file is given(.*\n)*.*sl-calibrate makes one"):
+        require_intrinsics(replace(config, intrinsics=None), projector_needed=True)
+    require_intrinsics(replace(config, intrinsics=None), projector_needed=False)
+
+
+@pytest.mark.parametrize("more", [{"rig": "rigid"}, {"rig": "static-projector"}, {"estimate_projector": True}])
+def test_what_only_the_adjustment_can_do_cannot_be_asked_for_without_it(ramp_scan, tmp_path, more):
+    with pytest.raises(UserError, match=r"--no-adjust and --(rig|estimate-projector)"):
+        ramp_scan.config(tmp_path / "s", no_adjust=True, **more).check()
