@@ -40,7 +40,7 @@ LEAST_COSINE = 1e-3  # between a ray and the optical axis; others cannot be writ
 STARTS = 8  # solutions from samples that are refined
 FEWEST_IN_PLANE = 20  # correspondences with which a plane is looked for
 LEAST_TRANSLATION = 1e-6  # distances of the plane; below it, two devices differ by a rotation alone
-POLISHING_ITERATIONS = 12  # of the refinement of first solutions
+POLISHING_ITERATIONS, POLISHING_TOLERANCE = 12, 1e-6  # of the refinement of first solutions
 VOTING_SIGMAS = 3.0  # noise within which a correspondence votes on which side the surface lies
 LEAST_IN_FRONT = 0.5  # share of the votes
 RIVAL_SHARE = 0.03  # of the correspondences that a rival may explain less than the best solution
@@ -77,7 +77,7 @@ def relative_pose_candidates(
     """Distinct local optima with most rays meeting in front of both devices, the best first; may be empty."""
     starts = five_point_starts(rays, rng) + plane_starts(rays)
     some = rays.chosen(subsample(np.arange(len(rays)), counts.polishing, rng))
-    fits = [fit_epipolar(R, t, some, POLISHING_ITERATIONS) for R, t in starts]
+    fits = [fit_epipolar(R, t, some, POLISHING_ITERATIONS, POLISHING_TOLERANCE) for R, t in starts]
     found = distinct_fits([fit for fit in fits if _mostly_in_front(fit, some)], CANDIDATE_SEPARATION)
     return ranked(found, rays.chosen(subsample(np.arange(len(rays)), counts.ranking, rng)))
 

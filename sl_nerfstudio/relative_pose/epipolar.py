@@ -11,6 +11,7 @@ Five unknowns (w, b): `R <- exp(w) R` rotates the projector about its own centre
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
@@ -293,27 +294,40 @@ def noise_of(residual: Float64[ndarray, "n"]) -> float:
 
 
 def fit_epipolar(
-    R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPairs, iterations: int = 30
+    R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"], rays: RayPairs, iterations: int = 30, tolerance: float = 1e-10
 ) -> EpipolarFit:
     """Levenberg-Marquardt from a start that is right to within a few degrees.
 
-    The kernel follows the noise as it falls, and never widens again (graduated non-convexity).
+    The kernel follows the noise as it falls, and never widens again (graduated non-convexity). The fit ends where the
+    cost can fall by no more than the tolerance, as a share of it.
     """
-    width = np.inf
+    width, floor = np.inf, len(rays) * NOISE_FLOOR_PX**2  # the floor ends the search where everything fits exactly
+    kept: list[Any] = [None, None]  # the last pose, and its residuals
+
+    def residual(pose: UnitPose) -> Float64[ndarray, "n"]:
+        if kept[0] is not pose:
+            kept[:] = pose, sampson(*pose, rays)
+        return kept[1]
 
     def narrow(pose: UnitPose) -> None:
         nonlocal width
-        width = min(width, KERNEL_SIGMAS * noise_of(sampson(*pose, rays)))
+        width = min(width, KERNEL_SIGMAS * noise_of(residual(pose)))
 
     def equations(pose: UnitPose) -> NormalEquations:
         r, J = sampson_jacobian(*pose, rays)
         return NormalEquations.of(J, r, geman_mcclure_weight((r / width) ** 2))
 
     def cost(pose: UnitPose) -> float:
-        return width**2 * float(geman_mcclure_cost((sampson(*pose, rays) / width) ** 2).sum()) / 2
+        return (width**2 * float(geman_mcclure_cost((residual(pose) / width) ** 2).sum()) + floor) / 2
 
     R, t = minimise(
-        (R, t), equations, lambda pose, step: moved(*pose, step), cost, narrow=narrow, iterations=iterations
+        (R, t),
+        equations,
+        lambda pose, step: moved(*pose, step),
+        cost,
+        narrow=narrow,
+        iterations=iterations,
+        tolerance=tolerance,
     ).state
     r = sampson(R, t, rays)
     return EpipolarFit(R, t, r, noise_of(r))

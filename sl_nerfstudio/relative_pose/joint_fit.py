@@ -171,6 +171,7 @@ class JointProblem:
         self._offset, self._sigma = mean[self._free], PRIOR_SIGMA[self._free]
         _, self._block = np.unique(matches.block, return_inverse=True)
         self._width = np.inf
+        self._kept: tuple[JointState, ndarray] | None = None  # the last state, and its residuals
 
     def fit(self, poses: Sequence[UnitPose], iterations: int = 40) -> JointFit:
         """Levenberg-Marquardt; the kernel follows the noise as it falls, and never widens again."""
@@ -209,12 +210,17 @@ class JointProblem:
         poses = [moved(R, t, share * b) for R, t, b in zip(state.R, state.t, by_pose, strict=True)]
         return JointState(values, np.stack([R for R, _ in poses]), np.stack([t for _, t in poses]))
 
+    def _residuals(self, state: JointState) -> Float64[ndarray, "n"]:
+        if self._kept is None or self._kept[0] is not state:
+            self._kept = state, self.residuals(state)
+        return self._kept[1]
+
     def _narrow(self, state: JointState) -> None:
-        r = self.residuals(state)
+        r = self._residuals(state)
         self._width = min(self._width, KERNEL_SIGMAS * noise_of(r[np.isfinite(r)]))
 
     def _cost(self, state: JointState) -> float:
-        r = np.nan_to_num(self.residuals(state), nan=np.inf)
+        r = np.nan_to_num(self._residuals(state), nan=np.inf)
         data = self._width**2 * float(geman_mcclure_cost((r / self._width).clip(-1e6, 1e6) ** 2).sum())
         departure = (state.values[self._free] - self._offset) / self._sigma
         return (data + (self._width / KERNEL_SIGMAS) ** 2 * float(departure @ departure)) / 2
