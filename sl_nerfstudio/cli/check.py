@@ -81,8 +81,7 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
     result = check_folder(folder)
     if result.faults:
         raise ScanError(result.faults, str(folder))
-    from sl_nerfstudio.review.agreement import compare_scan_frames
-    from sl_nerfstudio.review.coverage import shared_surface_of_scan
+    from sl_nerfstudio.review.agreement import compare_scan_frames, shared_surface_of_scan
 
     scan, said = result.scan, ""
     if scan is not None:

@@ -12,10 +12,11 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast, runtime_checkable
 
 import torch
+import torch.distributed as dist
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import Trainer
 from nerfstudio.utils import comms
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from sl_nerfstudio.console import Phase, paragraph, phase
@@ -27,7 +28,6 @@ from sl_nerfstudio.field.optimiser import RowAdam
 from sl_nerfstudio.field.simd import needs_compiling
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.model.optimisers import make_recordable
-from sl_nerfstudio.model.processes import SharedOptimizers, greatest, several, share_state
 from sl_nerfstudio.model.run_files import (
     INTERRUPTION,
     PARTIAL,
@@ -45,6 +45,55 @@ from sl_nerfstudio.rendering.volume_rendering import comes_below, first_crossing
 
 if TYPE_CHECKING:
     from sl_nerfstudio.model.model import SLModel
+
+# What the processes of one training, one on each GPU, share: a start, the mean of their gradients, and an end.
+#
+# nerfstudio starts them (`--machine.num-devices`), and would wrap the model in torch's DistributedDataParallel.
+# That
+# averages the gradients of what a module's `forward` computed; here most losses are computed after it, and kernels
+# write
+# the table's gradient themselves. So gradients are averaged before each step of the optimisers, with the same
+# result:
+# each process draws its own pixels, and all of them take the same step.
+
+
+def several() -> bool:
+    """Whether this process trains together with others."""
+    return comms.get_world_size() > 1
+
+
+@torch.no_grad()
+def share_state(module: nn.Module) -> None:
+    """Give all processes the parameters and saved buffers of the main one."""
+    for tensor in module.state_dict().values():
+        whole = tensor.contiguous()
+        dist.broadcast(whole, 0)
+        if whole is not tensor:
+            tensor.copy_(whole)
+
+
+def greatest(number: int, device: str) -> int:
+    """The greatest of a small number over all processes."""
+    shared = torch.tensor(number, dtype=torch.int32, device=device)
+    dist.all_reduce(shared, dist.ReduceOp.MAX)
+    return int(shared)
+
+
+class SharedOptimizers(Optimizers):
+    """nerfstudio's optimisers, which step along the mean of all processes' gradients.
+
+    The mean is taken before a gradient scaler looks for infinities, so that all processes find the same.
+    """
+
+    @torch.no_grad()
+    def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
+        """See nerfstudio's Optimizers."""
+        for parameter in (parameter for name in param_groups for parameter in self.parameters[name]):
+            if parameter.grad is not None:
+                dist.all_reduce(parameter.grad)
+                parameter.grad /= dist.get_world_size()
+        super().optimizer_scaler_step_some(grad_scaler, param_groups)
+
 
 # The loops of a training step, compiled by another process while this one reads the scan and adjusts the poses.
 #

@@ -53,7 +53,7 @@ from sl_nerfstudio.processing.scan_poses import ScanPoses, find_scan_poses, requ
 from sl_nerfstudio.registration.register import choose_projectors, chosen_clouds, register
 from sl_nerfstudio.registration.result import Registration, without_undecided
 from sl_nerfstudio.registration.surfaces import FrameCloud
-from sl_nerfstudio.review.coverage import SurfaceShares, missing_shares, shared_surface
+from sl_nerfstudio.review.agreement import SurfaceShares, missing_shares, shared_surface
 from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.images import read_photograph
 from sl_nerfstudio.scan.write import ScanWriter, encode_json

@@ -32,8 +32,7 @@ from sl_nerfstudio.registration.result import (
     UndecidedProjector,
 )
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind
-from sl_nerfstudio.review.agreement import CrossFrameAgreement
-from sl_nerfstudio.review.coverage import SurfaceShares
+from sl_nerfstudio.review.agreement import CrossFrameAgreement, SurfaceShares
 from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, ScanFacts, Verdict, judge_scan, listed
 
 # Sentences for what relative pose estimation and registration found out about frames.

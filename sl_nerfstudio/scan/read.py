@@ -25,6 +25,7 @@ from sl_nerfstudio.scan.document import (
 from sl_nerfstudio.scan.images import read_coords_size, read_header
 from sl_nerfstudio.scan.types import (
     CAMERA_KEYS,
+    FARTHEST,
     FORMAT,
     PROJECTOR_KEYS,
     UNITS,
@@ -40,7 +41,6 @@ from sl_nerfstudio.scan.types import (
 # Whether a matrix is a pose: a rigid motion from device to world.
 
 TOLERANCE = 1e-4  # of the entries of R^T R: text with five digits passes, a scale error of 0.01 % does not
-FARTHEST = 1e12  # units from the origin: beyond, numbers of 16 digits do not hold a position exactly enough
 
 
 def pose_problem(T: Float64[ndarray, "..."]) -> Problem | None:

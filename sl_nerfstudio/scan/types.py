@@ -294,6 +294,7 @@ class GroundTruth:
 
 # The key `scale` of transforms.json: whether lengths are true, and which length was measured.
 
+FARTHEST = 1e12  # units from the origin: beyond, numbers of 16 digits do not hold a position exactly enough
 _KEYS = ("known", "source", "baseline_of", "distance_between", "length")
 _OLD_SOURCE = re.compile(r"baseline of frame (\d+)(?: \((.+)\))?")
 
@@ -412,8 +413,10 @@ def _read_bar(section: Fields) -> ScaleBar | None:
         )  # fmt: skip
         return None
     number = section.read_number("length")
-    if number is not None and number <= 0:
-        section.fault("length", f"is {number:g}", "a typing error", "give a length greater than 0")
+    if number is not None and not 0 < number <= FARTHEST:
+        section.fault(
+            "length", f"is {number:g}", "a typing error", f"give a length greater than 0, of {FARTHEST:g} units at most"
+        )
         number = None
     if not isinstance(ends, list) or len(ends) != 2:
         section.fault("distance_between", "is not a list of two pixels", "wrong type", "see docs/scan-format.md")

@@ -52,7 +52,7 @@ def test_rows_are_kept_from_run_to_run(tmp_path, capsys):
     assert kept_rows(tmp_path / "r.json", Row) == [row] and kept_rows(tmp_path / "none.json", Row) == []
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_joint_adjustment_states_what_it_errs(rows):
     (row,) = rows("coverage", "--scenes", "cone-and-cylinder", "--seeds", 1, "--noises", "low")
     for name in ("relative", "camera", "length"):
@@ -61,14 +61,14 @@ def test_the_joint_adjustment_states_what_it_errs(rows):
     assert row["camera_mm"] < 0.5 and row["camera_deg"] < 0.1
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_the_decoder_reads_what_is_rendered(rows):
     found = rows("decoding", "--scenes", "head", "--resolutions", 400, "--frames", 1)
     assert [row["conditions"] for row in found] == ["plain", "strong"]
     assert found[0]["decoded"] > 0.8 and found[0]["median"] < 0.5 and found[0]["wrong"] < 0.01
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_poses_are_found_on_the_true_surface(rows, tmp_path):
     words = ("--scenes", "cone-and-cylinder", "--seeds", 1, "--ways", "Gauss-Newton", "--folder", tmp_path / "scans")
     (row,) = rows("pose_conditioning", *words)

@@ -16,7 +16,13 @@ from sl_nerfstudio.bundle_adjustment.adjust import adjust
 from sl_nerfstudio.bundle_adjustment.basin_hopping import Hopped, hopped, is_rough, log_odds, registered_start
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import departure_of
-from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, RefinePoses, baseline_scale, restore
+from sl_nerfstudio.bundle_adjustment.parameters import (
+    USUAL_FRAME_ROTATION_DEG,
+    PosePrior,
+    RefinePoses,
+    baseline_scale,
+    restore,
+)
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.search import (
     AdjustmentSettings,
@@ -26,7 +32,6 @@ from sl_nerfstudio.bundle_adjustment.search import (
     search,
 )
 from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_so3
-from sl_nerfstudio.model.pose_refinement import PriorConfig
 
 from . import analytic
 from .analytic import ExactMaps, disturbed, images_of, prior_of, rig_of, rough_prior, turned
@@ -236,7 +241,7 @@ ROUND = (0.0, 0.0, 0.0, 0.45)  # a ball on the axis of the disk
 FEATURE = (0.25, 0.0, 0.38, 0.12)  # a smaller one on it, the only thing that shows how the object is turned
 LARGER = (0.3, 0.0, 0.3, 0.25)
 ONE_HOP = replace(SETTINGS, anchors_per_frame=200, frames_per_anchor=8, hops=1)
-UNSTATED_DEG = PriorConfig().frame_rotation_deg
+UNSTATED_DEG = USUAL_FRAME_ROTATION_DEG
 NOTHING_KNOWN = prior_of(MANY, *[1e6] * 4)
 
 

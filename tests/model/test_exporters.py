@@ -4,7 +4,7 @@ import numpy as np
 import torch
 import trimesh
 
-from sl_nerfstudio.model.exporters import unwrap_mesh_with_xatlas
+from sl_nerfstudio.model.pipeline import unwrap_mesh_with_xatlas
 
 
 def test_rays_of_a_sphere_start_on_it_and_lead_inwards():

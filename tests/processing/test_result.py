@@ -38,7 +38,7 @@ from sl_nerfstudio.registration.result import (
     UndecidedProjector,
 )
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind, estimate_relative_pose
-from sl_nerfstudio.review.coverage import SurfaceShares
+from sl_nerfstudio.review.agreement import SurfaceShares
 from sl_nerfstudio.scan import PickedPixel, Scale
 from tests.processing.conftest import SHORT
 from tests.processing.ramp_scan import NAMES

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.review.coverage import missing_shares, shared_surface, shared_surface_of_scan
+from sl_nerfstudio.review.agreement import missing_shares, shared_surface, shared_surface_of_scan
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise

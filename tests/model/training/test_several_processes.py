@@ -15,9 +15,9 @@ from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils import comms
 from torch import nn
 
+from sl_nerfstudio.model.loop import SharedOptimizers, greatest, share_state
 from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.optimisers import RowAdamOptimizerConfig
-from sl_nerfstudio.model.processes import SharedOptimizers, greatest, share_state
 from sl_nerfstudio.model.run_files import INTERRUPTION
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from tests.field.fields import make_field, points_around
