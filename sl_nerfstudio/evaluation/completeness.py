@@ -130,8 +130,7 @@ def assess_completeness(surface: IndexedMesh, agreement: CaptureAgreement) -> Co
 #
 # A place of the surface that no frame sees may lie anywhere within the size of the opening; a frame that sees it
 # determines it to the decoding noise, divided by the pattern pixels per length along its ray. Information (1 /
-# variance)
-# adds up.
+# variance) adds up.
 
 _LEAST_COSINE = 0.2  # between normal and ray of either device: what is seen at a flatter angle is hardly decoded
 _SEED = 0

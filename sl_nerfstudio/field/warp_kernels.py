@@ -13,12 +13,9 @@ from sl_nerfstudio.field.hash_grid import PRIMES
 # The feature grid in Warp: encode points, their directional derivatives, and the adjoints of both.
 #
 # An encoded point has `FIRST` columns of its own (0..2 the point, 3 the constant 1, which carries the first layer's
-# bias,
-# 4..7 zero), then eight per level: the layout of the compiled CPU kernels. One thread has one point and one level,
-# or all
-# levels of a point where it sums over them. Points that are not numbers read the table's first cell. `places` has a
-# row
-# per level (see `HashGrid`); `smooth` is 1 for smoothstep weights.
+# bias, 4..7 zero), then eight per level: the layout of the compiled CPU kernels. One thread has one point and one
+# level, or all levels of a point where it sums over them. Points that are not numbers read the table's first cell.
+# `places` has a row per level (see `HashGrid`); `smooth` is 1 for smoothstep weights.
 
 FEATURES = 8
 FIRST = 8

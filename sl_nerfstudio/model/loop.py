@@ -48,13 +48,10 @@ if TYPE_CHECKING:
 
 # What the processes of one training, one on each GPU, share: a start, the mean of their gradients, and an end.
 #
-# nerfstudio starts them (`--machine.num-devices`), and would wrap the model in torch's DistributedDataParallel.
-# That
+# nerfstudio starts them (`--machine.num-devices`), and would wrap the model in torch's DistributedDataParallel. That
 # averages the gradients of what a module's `forward` computed; here most losses are computed after it, and kernels
-# write
-# the table's gradient themselves. So gradients are averaged before each step of the optimisers, with the same
-# result:
-# each process draws its own pixels, and all of them take the same step.
+# write the table's gradient themselves. So gradients are averaged before each step of the optimisers, with the same
+# result: each process draws its own pixels, and all of them take the same step.
 
 
 def several() -> bool:

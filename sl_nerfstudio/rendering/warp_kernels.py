@@ -387,11 +387,9 @@ def triangulate(
 
 # The losses on triangulated points and on the field's slope, with their adjoints; see `rendering/direct_losses.py`.
 #
-# There are n triangulated points and m others. `f` and `slope` are the field and its gradient at all of them,
-# `sides` the
-# field in front of the n points, then behind them. The sums, from number 5 on: weights; the surface term; how many
-# points
-# count; the terms in front and behind; the facing term; the Eikonal term, and how many points it has.
+# There are n triangulated points and m others. `f` and `slope` are the field and its gradient at all of them, `sides`
+# the field in front of the n points, then behind them. The sums, from number 5 on: weights; the surface term; how
+# many points count; the terms in front and behind; the facing term; the Eikonal term, and how many points it has.
 
 _LEAST_DESCENT = wp.constant(0.05)  # as in losses.py
 _BEHIND, _FACING = wp.constant(0.3), wp.constant(0.1)  # as in direct_losses.py

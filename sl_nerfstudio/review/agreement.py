@@ -432,10 +432,8 @@ def bridges(edges: Sequence[Pair], nodes: Iterable[int]) -> list[tuple[Pair, lis
 # decoded. That says nothing against the frame. What the others decoded does: it is there, and can be decoded.
 #
 # Where both devices of a frame look at a surface, and nothing that any frame shows lies before it, the camera sees
-# the
-# pattern. If it does not, this frame is at the wrong place, or those that show the surface are: faces of a box
-# agree with
-# each other at many places, and nothing but their ends tells which is right.
+# the pattern. If it does not, this frame is at the wrong place, or those that show the surface are: faces of a box
+# agree with each other at many places, and nothing but their ends tells which is right.
 
 _MARGIN = 0.02  # share of the image's longer side: how far from all that a frame saw of the pattern it saw nothing, and
 # how far inside the image and the pattern a point must lie
