@@ -295,7 +295,7 @@ def test_brightness_is_matched_in_least_squares() -> None:
 
 def test_the_overlap_graph_is_a_drawing_with_every_frame_and_edge() -> None:
     names = ["a", "b & c", "<d>"]
-    frames = [FrameRecord(name, name != "<d>", "", "") for name in names]
+    frames = [FrameRecord(name, name != "<d>") for name in names]
     edges = [
         EdgeRecord(("a", "b & c"), overlap=0.5, fitness=0.9, used=True, undecided=False),
         EdgeRecord(("a", "<d>"), overlap=0.1, fitness=0.2, used=False, undecided=False),
