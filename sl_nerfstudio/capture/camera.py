@@ -270,7 +270,6 @@ def share_seen(times_seen: Int[ndarray, "rows columns"], times: int = 1) -> floa
 
 DESCRIPTION = "capture.json"
 FORMAT = 1
-_COMPARED = {"sl_capture": "format", "pattern": "pattern", "w": "image width", "h": "image height"}
 _UNFINISHED = ".sl-unfinished"  # a sequence that is being written
 _FRAME = re.compile(r"frame_(\d+)(\.png)?")
 

@@ -39,7 +39,6 @@ from sl_nerfstudio.processing.inputs import CaptureNotes, Inputs
 from sl_nerfstudio.processing.records import LargeClouds
 from sl_nerfstudio.registration.result import NoCommonSurface, Registration
 from sl_nerfstudio.registration.static_projector import (
-    DOUBTFUL_SIGMA,
     NoPlacement,
     StaticPlacement,
     place_under_static_projector,
@@ -54,7 +53,13 @@ from sl_nerfstudio.relative_pose.estimation import (
 )
 from sl_nerfstudio.relative_pose.intrinsics import Explanation, IntrinsicsEvidence, Role, check_intrinsics
 from sl_nerfstudio.relative_pose.joint_fit import CX, CY, K1, LOG_ASPECT, LOG_FOCAL, FrameMatches
-from sl_nerfstudio.relative_pose.unknown_projector import Cause, NoProjector, ProjectorEstimate, estimate_projector
+from sl_nerfstudio.relative_pose.unknown_projector import (
+    DOUBTFUL_SIGMA,
+    Cause,
+    NoProjector,
+    ProjectorEstimate,
+    estimate_projector,
+)
 
 # Sentences on intrinsics that were found, could not be found, or are contradicted.
 

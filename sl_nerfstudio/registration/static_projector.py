@@ -30,6 +30,7 @@ from sl_nerfstudio.relative_pose.joint_fit import (
     device_with,
     values_of,
 )
+from sl_nerfstudio.relative_pose.unknown_projector import LARGEST_SIGMA
 
 # Squares of the pattern at whose centres all cameras are compared.
 CELL_PIXELS = 20.0  # camera pixels in a square, in the mean
@@ -64,8 +65,6 @@ CONVERGED = 1e-6  # share of the cost that a step must gain for the search to go
 STANDARD_ERRORS = 2.0  # by which left-out squares must agree better for another free parameter
 FOLDS = 4  # parts that are left out in turn
 DEPENDENCE = 2.0  # factor on the stated sigma: neighbouring squares share errors of decoding and of the lens
-LARGEST_SIGMA = 0.08  # of the focal length, as a share, beyond which there is no result
-DOUBTFUL_SIGMA = 0.02  # the same beyond which the result is doubtful
 LARGEST_NOISE_SHARE = 0.005  # of the pattern's width, beyond which no single projector explains what the cameras see
 DIFFERENCE_STEP = 1e-6  # change of the intrinsics for derivatives
 
