@@ -6,7 +6,7 @@ its own once components have grown, and a weak cut between two blocks is judged 
 stays undecided remain apart.
 """
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,19 +15,15 @@ from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
-from sl_nerfstudio.geometry.lie import Similarities, Similarity, angle_deg, exps_at, log_at, logs_at
+from sl_nerfstudio.geometry.lie import Similarities, Similarity, angle_deg, exps_at, logs_at
 from sl_nerfstudio.geometry.numerics import geman_mcclure_cost, geman_mcclure_weight
-from sl_nerfstudio.registration.agreement import Agreement, Hypotheses, Side, Tolerance, agreement
+from sl_nerfstudio.registration.evidence import ScanEvidence
 from sl_nerfstudio.registration.pairs import (
-    GOOD_QUANTILE,
-    SLIP_RISE,
+    LEAST_ODDS,
+    SAME_PLACE_DEG,
+    SAME_PLACE_SHIFT,
     PairMatch,
     edge_weights,
-    motion_cost,
-    quality,
-    rise_of,
-    screw_motion,
-    support,
 )
 
 # The pose graph.
@@ -41,21 +37,8 @@ LARGEST_LOG_SCALE_STEP = 0.5  # change of the logarithm of a scale in a step
 STEP_FACTORS = (1.0, 0.5, 0.25, 0.1, 0.02)  # on a step, until one costs no more than none
 
 # Which components are joined.
-CROSS_SIGMAS = 6.0  # of two surfaces within which points agree: components have small errors of their own
-LEAST_AGREEING = 0.15  # points that must agree across two components, in frames: 1 is all points of one frame
-MISFIT_FACTOR = 2.5  # on the share of points that contradict in good pairs of the scan: what a connection may have
-INNER_MISFIT_FACTOR = 1.6  # the same, relative to frames of one component that look as much alike
-LEAST_MISFIT = 0.015  # share that may contradict in good pairs: points at edges do in every pair
-LARGEST_SIGMA_DEG = 6.0  # of the least known rotation of a pair that joins two components on its own
-LARGEST_RIVAL = 0.85  # votes for another similarity, relative to the best, from which the connection is undecided
-SLIP_DEG = 8.0  # rotation along which two components must notice that they slip
-SLIP_WIDTHS = (0.4, 0.8, 1.6, 3.2)  # of the kernel of that test, in sigmas of the surfaces: the first wide enough
-SATURATED = 0.4  # mean cost from which a kernel is too narrow for the errors that components have of their own
-SAME_CHI2 = 30.0  # of the difference between two similarities (7 degrees of freedom) up to which they are one
-MOST_COMPARED = 8  # clearly different similarities
-SAME_SIDE_DEG = 8.0  # rotation between two similarities below which they are one
-SAME_SIDE_SHIFT = 0.2  # shift between two similarities, radii, below which they are one
-MOST_PAIRS = 12  # of frames across two components that are compared
+MOST_COMPARED = 12  # clearly different similarities
+MOST_PAIRS = 10  # of frames across two components that are compared
 LEAST_SIGHT_COSINE = float(np.cos(np.radians(75.0)))  # between lines of sight: beyond it frames share no surface
 
 Component = dict[int, Similarity]  # S_world_camera of some frames, in a world of their own
@@ -221,61 +204,55 @@ class Link:
     """A similarity between two components that a pair across says."""
 
     S_first_second: Similarity
-    quality: float
+    log_odds: float  # of the pair's place against nothing
     edge: PairMatch
-    best: bool  # of the pair: False for a rival
 
 
 @dataclass(frozen=True)
 class Joint:
-    """Agreement of two components under one similarity: sums over pairs of frames across them."""
+    """Two components under one similarity: log-odds summed over pairs of frames across them, in nats."""
 
     S_first_second: Similarity
-    votes: float  # of registered pairs: their quality, where it is their best result, or a share of it
-    links: int  # registered pairs of which it is the best result
-    agreeing: float  # points, in frames: 1 is all points of one frame
-    contradicting: float
+    seen: float  # by what the frames decoded
+    usual: float  # by the order of capture
 
     @property
-    def fitness(self) -> float:
-        """Share of the points that could be judged which agrees."""
-        return self.agreeing / max(self.agreeing + self.contradicting, 1e-9)
+    def log_odds(self) -> float:
+        """Both together."""
+        return self.seen + self.usual
+
+
+Prior = Callable[[int, int, Similarity], float]
 
 
 class Assembly:
-    """Components of frames, grown along registered pairs."""
+    """Components of frames, grown along registered pairs.
+
+    Two components are joined at the place at which all frames across them that face each other there, registered or
+    not, are together most likely to belong; if that leads all others by enough.
+    """
 
     def __init__(
-        self,
-        sides: Sequence[Side],
-        pivots: Pivots,
-        edges: Sequence[PairMatch],
-        slipping: Sequence[PairMatch] = (),
-        fitness: Sequence[float] | None = None,
-        misfit_factor: float = MISFIT_FACTOR,
-    ) -> None:
+        self, scan: ScanEvidence, pivots: Pivots, edges: Sequence[PairMatch], prior: Prior | None = None,
+        slipping: bool = False,
+    ) -> None:  # fmt: skip
         """Start with every frame as a component of its own.
 
         Args:
-            sides: points of every frame.
+            scan: compares frames.
             pivots: of every frame, for the pose graph.
-            edges: pairs that may join components.
-            slipping: pairs that may slip. They only say along which motions two components must be held in place.
-            fitness: of the pairs by which a good one is judged; None: of all edges.
-            misfit_factor: see MISFIT_FACTOR.
+            edges: pairs that say where components may belong.
+            prior: log-odds, in nats, of the place of a frame on another by the order of capture.
+            slipping: components are joined though they may slip along each other.
         """
-        self._slipping = slipping
-        self._sides = sides
-        self._pivots = pivots
-        self._edges = sorted(edges, key=lambda e: -quality(e))
+        self._scan, self._pivots, self._prior, self._slipping = scan, pivots, prior, slipping
+        self._edges = sorted(edges, key=lambda e: -e.lead)
         self._weight = edge_weights(self._edges)
         self._rejected: set[tuple[int, int]] = set()  # of the numbers of two components
-        fitness = [e.fitness for e in edges] if fitness is None else fitness
-        usual = float(np.quantile(fitness, GOOD_QUANTILE)) if len(fitness) else 1.0
-        self._largest_misfit = misfit_factor * max(LEAST_MISFIT, 1 - usual)
-        self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(sides))]
-        self._number = list(range(len(sides)))  # of each frame's component
+        self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(pivots))]
+        self._number = list(range(len(pivots)))  # of each frame's component
         self._joins = 0
+        self.by_order = False  # the order of capture has decided a place that surfaces did not
 
     def grow(self) -> list[Component]:
         """Join components until no connection is decided; the largest first."""
@@ -297,7 +274,7 @@ class Assembly:
             self.components.append(self._joined(first, second, joint.S_first_second))
             self._joins += 1
             for k in self.components[-1]:
-                self._number[k] = len(self._sides) - 1 + self._joins
+                self._number[k] = len(self._pivots) - 1 + self._joins
             return True
         return False
 
@@ -312,187 +289,76 @@ class Assembly:
 
     def decide(self, first: Component, second: Component) -> Joint | None:
         """The similarity between two components; None where it is not certain."""
-        found = [(self._score(j, first, second), j) for j in self._joints(first, second)]
-        if not found:
+        joints = sorted(self._joints(first, second), key=lambda joint: -joint.log_odds)
+        if not joints or joints[0].log_odds < LEAST_ODDS:
             return None
-        (score, best), *others = sorted(found, key=lambda scored: -scored[0])
-        if best.agreeing < LEAST_AGREEING or score <= 0:
-            return None
-        if others and others[0][0] > LARGEST_RIVAL * score:
-            return None
-        if not self._held_by_tone(best, first, second) and any(
-            self._slips(best, e, first, second) for e in self._between(self._slipping, first, second)
-        ):
-            return None
-        if best.links < 2 and not self._certain_alone(first, second):
-            return None
+        best = joints[0]
+        apart = [j for j in joints[1:] if self.differ(j.S_first_second, best.S_first_second, second)]
+        if any(j.log_odds > best.log_odds - LEAST_ODDS for j in apart):
+            if not self._slipping:
+                return None
+        elif any(j.seen > best.seen - LEAST_ODDS for j in apart):
+            self.by_order = True
         return best
 
-    def _score(self, joint: Joint, first: Component, second: Component) -> float:
-        """Votes, less where points contradict; nothing where more do than in good pairs and inside the components."""
-        S = joint.S_first_second
-        cosines = [_cosine(first[i], S @ second[j]) for i, j in self._facing(first, second, S)]
-        inner = max(self._inner_misfit(one, cosines) for one in (first, second))
-        largest = max(self._largest_misfit, INNER_MISFIT_FACTOR * inner)
-        return joint.votes * max(0.0, 1 - (1 - joint.fitness) / largest)
-
-    def _inner_misfit(self, component: Component, cosines: Sequence[float]) -> float:
-        """Share of the points that contradict between frames of one component; 0 if there is no such pair.
-
-        For each pair of frames across two components, of which `cosines` has the cosine between the lines of sight,
-        one pair inside is judged that looks about as much alike: frames that are farther apart share less surface, and
-        more of it lies at edges.
-        """
-        frames = sorted(component)
-        i, j = np.triu_indices(len(frames), 1)
-        sight = np.array([component[k].R[:, 2] for k in frames])
-        inside = (sight[i] * sight[j]).sum(1)
-        if not len(cosines) or not (inside > LEAST_SIGHT_COSINE).any():
-            return 0.0
-        nearest = {int(np.abs(inside - cosine).argmin()) for cosine in cosines}
-        alike = [(frames[i[k]], frames[j[k]]) for k in nearest]
-        agreeing, contradicting = self._totals(
-            self._agreement(i, j, component[i].inverse() @ component[j]) for i, j in alike
-        )
-        return contradicting / max(agreeing + contradicting, 1e-9)
-
     def _joints(self, first: Component, second: Component) -> list[Joint]:
-        """The clearly different similarities between two components that pairs across say, with their votes."""
-        links = [self._links(e, first, second) for e in self._between(self._edges, first, second)]
+        """The clearly different similarities between two components that pairs across say."""
+        links = [link for e in self._between(first, second) for link in self._links(e, first, second)]
         distinct: list[Link] = []
-        for link in sorted((one for of_pair in links for one in of_pair), key=lambda one: -one.quality):
-            if not any(self._same(link, other.S_first_second, first, second) for other in distinct):
+        for link in sorted(links, key=lambda one: -one.log_odds):
+            if len(distinct) == MOST_COMPARED:
+                break
+            if all(self.differ(link.S_first_second, other.S_first_second, second) for other in distinct):
                 distinct.append(link)
-        return [self._judge(first, second, one.S_first_second, links) for one in distinct[:MOST_COMPARED]]
+        return [self.judge(first, second, one.S_first_second) for one in distinct]
+
+    def _between(self, first: Component, second: Component) -> list[PairMatch]:
+        return [
+            e
+            for e in self._edges
+            if (e.source in first and e.target in second) or (e.source in second and e.target in first)
+        ]
 
     @staticmethod
-    def _between(edges: Sequence[PairMatch], first: Component, second: Component) -> list[PairMatch]:
-        return [
-            e for e in edges if (e.source in first and e.target in second) or (e.source in second and e.target in first)
-        ]
-
-    def _links(self, e: PairMatch, first: Component, second: Component) -> list[Link]:
-        """What a pair across says: its best similarity and its rivals, each with its quality."""
+    def _links(e: PairMatch, first: Component, second: Component) -> list[Link]:
+        """What a pair across says: its best similarity and its rivals."""
         forward = e.source in second
         target, source = (e.target, e.source) if forward else (e.source, e.target)
-        best = support(e)
-        results = [(e.S_target_source, best), *((r.S_target_source, best * r.ratio) for r in e.rivals)]
+        places = [(e.S_target_source, e.log_odds)]
+        places += [(r.S_target_source, e.log_odds + r.log_odds) for r in e.rivals]
         return [
-            Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), q, e, k == 0)
-            for k, (S, q) in enumerate(results)
+            Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), odds, e)
+            for S, odds in places
         ]
 
-    def _same(self, link: Link, S: Similarity, first: Component, second: Component) -> bool:
-        """Whether a similarity is that of a link, to within the uncertainty of its pair."""
-        if not self._differ(S, link.S_first_second, second):
-            return True
-        if not link.best:
-            return False
-        e = link.edge
-        T = S if e.source in second else S.inverse()
-        own, other = (first, second) if e.source in second else (second, first)
-        D = own[e.target].inverse() @ T @ other[e.source] @ e.S_target_source.inverse()
-        x = log_at(D, self._pivots.centre[e.target], self._pivots.radius[e.target])
-        return bool(x @ e.information @ x < SAME_CHI2)
+    def judge(self, first: Component, second: Component, S: Similarity) -> Joint:
+        """All frames across that face each other at a place."""
+        seen = usual = 0.0
+        for i, j in facing(first, second, S):
+            S_i_j = first[i].inverse() @ S @ second[j]
+            seen += float(self._scan.log_odds(j, i, [S_i_j])[0])
+        if self._prior is not None:
+            usual = sum(self._prior(i, j, first[i].inverse() @ S @ second[j]) for i in first for j in second)
+        return Joint(S, seen, usual)
 
-    def _judge(self, first: Component, second: Component, S: Similarity, links: Sequence[Sequence[Link]]) -> Joint:
-        """Votes of the pairs across, and the points of all frames across that see the same side."""
-        votes, same = 0.0, 0
-        for of_pair in links:
-            near = [link for link in of_pair if self._same(link, S, first, second)]
-            votes += max((link.quality for link in near), default=0.0)
-            same += any(link.best for link in near)
-        across = self._agreements(first, second, S)
-        return Joint(S, votes, same, *self._totals(across))
-
-    def _agreements(
-        self, first: Component, second: Component, S: Similarity, sigmas: float = CROSS_SIGMAS
-    ) -> Iterator[Agreement]:
-        """Each pair of frames across that see the same side, within some standard deviations of their surfaces."""
-        for i, j in self._facing(first, second, S):
-            yield self._agreement(i, j, first[i].inverse() @ S @ second[j], sigmas)
-
-    def _agreement(self, i: int, j: int, S_i_j: Similarity, sigmas: float = CROSS_SIGMAS) -> Agreement:
-        return agreement(self._sides[j], self._sides[i], Hypotheses.of(S_i_j), Tolerance(0.0, sigmas))
-
-    def _totals(self, pairs: Iterable[Agreement]) -> tuple[float, float]:
-        """Points that agree, and those that contradict, of all pairs."""
-        agreeing = contradicting = 0.0
-        for sums in pairs:
-            agreeing += float(sums.agreeing[0])
-            contradicting += float(sums.contradicting[0])
-        return agreeing, contradicting
-
-    def _held_by_tone(self, joint: Joint, first: Component, second: Component) -> bool:
-        """Whether brightness constrains what geometry leaves free: a pair across that tones hold says the same."""
-        return any(
-            self._same(self._links(e, first, second)[0], joint.S_first_second, first, second)
-            for e in self._between(self._edges, first, second)
-            if e.by_tone
-        )
-
-    def _slips(self, joint: Joint, e: PairMatch, first: Component, second: Component) -> bool:
-        """Whether all frames across together do not notice the motion along which one pair of them slips."""
-        if not self._same(self._links(e, first, second)[0], joint.S_first_second, first, second):
-            return False  # the pair says something else
-        for sigmas in SLIP_WIDTHS:
-            still = self._misfit_cost(first, second, joint.S_first_second, sigmas)
-            if still < SATURATED:
-                break
-        own = first if e.target in first else second
-        surface, to_camera = self._sides[e.target].map, own[e.target].inverse()
-        rises = []
-        for sense in (1.0, -1.0):
-            M = screw_motion(sense * np.radians(SLIP_DEG) * e.slip_direction, surface)
-            M = own[e.target] @ M @ to_camera
-            S = M @ joint.S_first_second if own is first else joint.S_first_second @ M
-            rises.append(self._rise(first, second, joint.S_first_second, S, sigmas))
-        return min(rises) < SLIP_RISE
-
-    def _rise(self, first: Component, second: Component, still: Similarity, moved: Similarity, sigmas: float) -> float:
-        """Rise of the cost by a motion of one component against the other, all pairs of frames across together."""
-        costs = np.zeros((2, 4))
-        for i, j in self._facing(first, second, still):
-            before, after = (first[i].inverse() @ S @ second[j] for S in (still, moved))
-            costs += motion_cost((self._sides[j], self._sides[i]), before, after, Tolerance(0.0, sigmas))
-        return rise_of(costs)
-
-    def _misfit_cost(self, first: Component, second: Component, S: Similarity, sigmas: float) -> float:
-        """Mean robust cost over the pairs of frames across, by the points that each can judge; 1 without any."""
-        costs, weights = [1.0], [1e-9]
-        for sums in self._agreements(first, second, S, sigmas):
-            costs.append(float(sums.cost[0]))
-            weights.append(float(sums.judged[0]))
-        return float(np.average(costs, weights=weights))
-
-    def _certain_alone(self, first: Component, second: Component) -> bool:
-        """Whether one of the pairs across determines the similarity by itself."""
-        return any(
-            e.slip_deg == 0
-            and e.rotation_sigma_deg < LARGEST_SIGMA_DEG
-            and e.second_best_ratio < LARGEST_RIVAL
-            and 1 - e.fitness < self._largest_misfit
-            for e in self._between(self._edges, first, second)
-        )
-
-    def _facing(self, first: Component, second: Component, S: Similarity) -> list[tuple[int, int]]:
-        """The pairs across whose cameras look most nearly the same way."""
-        here, there = list(first), list(second)
-        sight = np.array([first[i].R[:, 2] for i in here]), np.array([(S.R @ second[j].R)[:, 2] for j in there])
-        cosine = (sight[0][:, None] * sight[1]).sum(-1).ravel()
-        near = np.argsort(-cosine, kind="stable")[:MOST_PAIRS]
-        return [(here[k // len(there)], there[k % len(there)]) for k in near if cosine[k] > LEAST_SIGHT_COSINE]
-
-    def _differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
+    def differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
         """Whether two similarities put the frames of `second` at clearly different places."""
-        if angle_deg(a.R @ b.R.T) > SAME_SIDE_DEG:
+        if angle_deg(a.R @ b.R.T) > SAME_PLACE_DEG:
             return True
         shifts = []
         for k, S in second.items():
-            surface = self._sides[k].map
-            p, radius = S.points(surface.centroid[None]), a.scale * S.scale * surface.radius
+            p, radius = S.points(self._pivots.centre[k][None]), a.scale * S.scale * self._pivots.radius[k]
             shifts.append(float(np.linalg.norm(a.points(p) - b.points(p))) / radius)
-        return min(shifts) > SAME_SIDE_SHIFT
+        return min(shifts) > SAME_PLACE_SHIFT
+
+
+def facing(first: Component, second: Component, S: Similarity, most: int = MOST_PAIRS) -> list[tuple[int, int]]:
+    """The pairs of frames across two components whose cameras look most nearly the same way."""
+    here, there = list(first), list(second)
+    sight = np.array([first[i].R[:, 2] for i in here]), np.array([(S.R @ second[j].R)[:, 2] for j in there])
+    cosine = (sight[0][:, None] * sight[1]).sum(-1).ravel()
+    near = np.argsort(-cosine, kind="stable")[:most]
+    return [(here[k // len(there)], there[k % len(there)]) for k in near if cosine[k] > LEAST_SIGHT_COSINE]
 
 
 def _cosine(a: Similarity, b: Similarity) -> float:

@@ -1,9 +1,12 @@
-"""Registration of two frames by a similarity: search over rotations where no guess is given, then refinement.
+"""Registration of two frames by a similarity: proposals from a search and a walk, compared by their likelihood.
 
-Point-to-plane with projective association (Blais and Levine, PAMI 1995), both ways, with a scale whose logarithm has a
-prior and a bound: each frame's baseline has an unknown length, but a free scale would collapse a cloud onto a patch.
+The search starts from many rotations and refines point-to-plane distances on coarse surfaces, with projective
+association (Blais and Levine, PAMI 1995), both ways. Its ends, and the places along the motion that surfaces know least,
+are refined on what the frames decoded and compared there (see evidence). The logarithm of the scale has a prior: each
+frame's baseline has an unknown length, but a free scale would collapse a surface onto a patch.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,15 +21,21 @@ from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.parallel import compiled_range
 from sl_nerfstudio.registration.agreement import (
     AGREEING_SIGMAS,
-    AGREES,
     COARSE_POINTS,
     LEAST_FACING_COSINE,
-    PENALTY,
-    Agreement,
     Hypotheses,
     Side,
     Tolerance,
     agreement,
+)
+from sl_nerfstudio.registration.evidence import (
+    ABSENT,
+    JUDGED,
+    Commonness,
+    Frame,
+    FrameEvidence,
+    PairEvidence,
+    Places,
 )
 from sl_nerfstudio.registration.surfaces import SurfaceMap
 
@@ -54,36 +63,47 @@ NEARBY = Search(20.0, 10.0)  # for frames that other pairs have placed
 START_SCALES = (0.8, 1.0, 1.25)  # relative to the one that makes the expected objects equally large, or equally far
 SEARCH_TOLERANCE = 0.15  # radii within which a point agrees while starts are compared
 COARSE_TOLERANCE = 0.06  # the same while the results of the first refinement are compared
-LIKENESS_POINTS, SEARCH_POINTS, FINE_POINTS = 80, 200, 1500  # points of each frame: to choose pairs, starts, at last
+LIKENESS_POINTS, SEARCH_POINTS = 80, 200  # points of each frame: to choose pairs, and starts
 COARSE_STARTS = 24  # best starts that are refined
-FINE_STARTS = 4  # best distinct results that are refined further
+MOST_PLACES = 16  # best distinct ends of the search that are compared
 KERNEL_SIGMAS = 3.0  # least width of the kernel, in standard deviations of the two surfaces
 COARSE_WIDTHS = (0.3, 0.3, 0.25, 0.25, 0.2, 0.2, 0.15, 0.15, 0.12, 0.1, 0.08, 0.08)  # of the kernel in each step, radii
-FINE_WIDTHS = (0.08, 0.06, 0.04, 0.03, 0.02, 0.015, 0.01, 0.0, 0.0, 0.0)
-LIKELY = 0.7  # share of the largest overlap that a result must have to say how closely surfaces agree
-COMMON_RMS = 2.5  # width at which results are compared, in root mean square distances of the closest one
-LEAST_WIDTH = 1.25  # least such width, in standard deviations of the surfaces
-COMMON_STEPS = 4  # of refinement with a kernel of that width
 DAMPING = 1e-4  # of a step, as a share of the trace of the normal equations
 LARGEST_STEP = 0.5  # radii
 SCALE_SIGMA = 0.25  # prior of the logarithm of the scale, about that of the start
+SCALE_POINTS = 40.0  # independent points against which that prior is weighed
 LARGEST_LOG_SCALE = 0.6  # bound of the logarithm of the scale, about that of the start
 SAME_ROTATION_DEG = 6.0  # rotation between two results below which they are one
 SAME_SHIFT = 0.12  # shift between two results, radii, below which they are one
 
+# Places that are compared. Widths of kernels are in standard deviations of the residuals.
+THINNED = 4  # only each so-manieth point is used to find places
+SEARCH_WIDTHS = (60.0, 40.0, 25.0, 15.0, 10.0, 7.0, 5.0, 4.0)
+WALK_WIDTHS = (8.0, 5.0, 4.0)
+FINE_WIDTHS = (4.0, 3.0, 3.0)
+STEP_DEG = 2.0  # of a walk: the peak that a feature makes is about as wide
+MOST_STEPS = 90  # in each sense: half a turn
+FINE_STEPS = 9  # between the steps of a walk before and after the best place
+LEAST_STRAIGHT = 0.7  # cosine between the axes of two steps
+LEAST_OVERLAP_OF_WALK = 0.25  # points that can be judged, relative to the start
+SAME_START_DEG = 1.0  # rotation between two ends of the search below which they are one
+SAME_PLACE_DEG, SAME_PLACE_SHIFT = 3.0, 0.1  # rotation and shift (radii) below which two places are one
+LEAST_ODDS = 10.0  # nats that decide: errors of the decoder that pixels share make wrong places lead by a few
+MOST_BEHIND = 80.0  # nats behind the best from which a place is no rival
+
 # Uncertainty of a pair.
-INDEPENDENT_POINTS = 40.0  # points that count as independent: neighbouring points share errors
-LEAST_INFORMATION = 1e-3  # on each unknown, inverse squares of radians and radii
-SHIFT_SIGMAS = 1.5  # error of the translation that all points share, in standard deviations of the surfaces
-TURN_SIGMAS = 0.4  # the same of rotation and scale, as lengths at one radius
-SLIP_ANGLES_DEG = (4.0, 8.0, 12.0)  # rotations by which slipping is tried
 BOUNDED_SLIP_DEG = 4.0  # up to which several pairs together connect frames: an uncertainty like any other
-SLIP_STEPS = 5  # by which the rest of the motion follows each of these rotations
-SLIP_SIGMAS = 3.0  # displacement along its normal, in sigmas of both surfaces, from which a point notices a motion
-SLIP_RISE = 0.056  # of the mean robust cost: three standard errors of 40 independent points of one sigma each
+LEAST_INFORMATION = 1e-3  # on each unknown, inverse squares of radians and radii
+ERROR_FACTOR = (
+    2.0  # on the sigma by the likelihood's curvature: the decoder's errors are shared over more than a window
+)
+LEAST_SIGMA_DEG, LEAST_SIGMA_SHIFT = 0.1, 0.002  # of rotations, and of shifts in radii: surfaces are bent a little
+MOST_RIVALS = 24
+LEAST_WEIGHT = 0.02  # of an edge with many rivals
 
 # Frames that would slip, held by the tone of their surface.
 TONE_STEP_DEG = 3.0  # rotation between places that are compared
+TONE_FINAL_STEPS = 5  # of refinement at the place that is taken
 TONE_FOLLOW_STEPS = 2  # by which the rest of the motion follows each of them
 TONE_FOLLOWED_POINTS = 300  # of each frame by which it follows
 TONE_POINTS = 5000  # of a frame that are compared at most
@@ -94,16 +114,8 @@ TONE_LEAST_LEAD = 2.0  # of that place over all others, in standard deviations o
 TONE_FEWEST_OTHERS = 12  # places that it must be compared with
 TONE_LEAST_SIGMA_DEG = 0.3  # of a rotation found so
 TONE_LARGEST_SIGMA_DEG = 1.5  # beyond it nothing is found: broad shades are as likely light as surface
-TONE_LARGEST_LOSS = 0.05  # share of the points that may agree less there than where the surfaces agree best
-
-# Which pairs are accepted, and their weights in the pose graph.
-LEAST_FITNESS = 0.6  # share of the points that can be judged which must agree
-LEAST_OVERLAP = 0.15  # share of all points which must agree
-AMBIGUOUS_RATIO = 0.85  # score of the second best result over the best from which a pair is ambiguous
-AMBIGUOUS_WEIGHT = 0.5  # factor of the weight of an ambiguous pair
-GOOD_QUANTILE = 0.75  # of the fitness of all pairs: that of good ones
-FITNESS_SCALE = 0.05  # fitness below that of good pairs at which a pair's weight falls to 1/e
-LEAST_WEIGHT = 0.02  # of the worst pair
+TONE_LARGEST_LOSS = 20.0  # nats by which surfaces may be less likely there
+TONE_SIGMAS = 4.0  # of two surfaces within which tones are compared
 
 
 @dataclass(frozen=True)
@@ -111,7 +123,7 @@ class Rival:
     """A clearly different similarity between the same two frames."""
 
     S_target_source: Similarity
-    ratio: float  # its score over that of the best one: 1 is as good
+    log_odds: float  # against the best one, nats: 0 is as likely
 
 
 @dataclass(frozen=True)
@@ -121,20 +133,22 @@ class PairMatch:
     source: int
     target: int
     S_target_source: Similarity
-    information: Float64[ndarray, "7 7"]  # of (v, w, l), see surface_agreement; lengths in radii of the target
+    information: Float64[ndarray, "7 7"]  # of (v, w, l), see agreement; lengths in radii of the target
     overlap: float  # fraction of all points that lie on the other frame's surface
-    fitness: float  # the same among the points that could be judged
-    rms: float  # distance of agreeing points from the surface, in radii
-    rivals: tuple[Rival, ...]  # the best first
+    fitness: float  # the same among the points that should be seen
+    log_odds: float  # that the frames belong here and not anywhere else, nats
+    rivals: tuple[Rival, ...]  # the most likely first
     rotation_sigma_deg: float  # standard deviation of the least known rotation
     slip_deg: float  # rotation that nothing tells from none: above zero on planes and surfaces of revolution
     slip_direction: Float64[ndarray, "7"]  # the motion (v, w, l) in the target's axes, about its centroid, |w| = 1
-    shape_slip_deg: float = 0.0  # the rotation that surfaces alone do not tell: larger than `slip_deg` where tones do
+    common: tuple[Commonness, Commonness]  # what the places that are not right say of each frame's points
+    noise: tuple[float, float]  # how much larger the residuals of each frame's points are than stated
+    by_shape: "PairMatch | None" = None  # what surfaces alone say, which let the frames slip, where tones hold them
 
     @property
-    def second_best_ratio(self) -> float:
-        """Score of the best rival over that of this similarity: 1 is ambiguous."""
-        return self.rivals[0].ratio if self.rivals else 0.0
+    def lead(self) -> float:
+        """Log-odds against all rivals, nats; also against the frames having nothing in common."""
+        return min([self.log_odds, *(-rival.log_odds for rival in self.rivals)])
 
     @property
     def holds(self) -> bool:
@@ -144,16 +158,7 @@ class PairMatch:
     @property
     def by_tone(self) -> bool:
         """Whether tones hold the frames where surfaces alone would let them slip."""
-        return self.shape_slip_deg > self.slip_deg
-
-    def without_tone(self) -> "PairMatch":
-        """The pair as one that slips."""
-        d, slip = self.slip_direction, np.radians(self.shape_slip_deg)
-        covariance = np.linalg.inv(self.information) + slip**2 * np.outer(d, d)
-        sigma_deg = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])))
-        return replace(
-            self, information=np.linalg.inv(covariance), rotation_sigma_deg=sigma_deg, slip_deg=self.shape_slip_deg
-        )
+        return self.by_shape is not None
 
     def between(self, source: int, target: int) -> Similarity:
         """The similarity from `source` to `target`, whichever way it was found."""
@@ -166,83 +171,73 @@ class PairMatch:
 
 
 def is_accepted(match: PairMatch) -> bool:
-    """Whether a pair overlaps and agrees well enough to be an edge."""
-    return match.fitness > LEAST_FITNESS and match.overlap > LEAST_OVERLAP
-
-
-def support(match: PairMatch) -> float:
-    """Score between 0 and 1: how much two surfaces agree, and how little contradicts."""
-    return support_of(match.overlap, match.fitness)
-
-
-def support_of(overlap: float, fitness: float) -> float:
-    """Support by the share of points that agree, and the share of those that could be judged."""
-    return overlap * fitness**2
-
-
-def quality(match: PairMatch) -> float:
-    """Score between 0 and 1 that ranks results of a pair, and pairs of a frame."""
-    clear = match.second_best_ratio < AMBIGUOUS_RATIO
-    return support(match) * (1.0 if clear else AMBIGUOUS_WEIGHT)
+    """Whether two frames have a surface in common, wherever it is."""
+    return match.log_odds > LEAST_ODDS
 
 
 def is_ambiguous(match: PairMatch) -> bool:
-    """Whether a clearly different similarity fits nearly as well."""
-    return match.second_best_ratio > AMBIGUOUS_RATIO
+    """Whether a clearly different similarity is nearly as likely."""
+    return any(rival.log_odds > -LEAST_ODDS for rival in match.rivals)
+
+
+def support_of(overlap: float, fitness: float) -> float:
+    """Score between 0 and 1 by the share of points that agree, and the share of those that should be seen."""
+    return overlap * fitness**2
 
 
 def edge_weights(edges: Sequence[PairMatch]) -> Float64[ndarray, "edges"]:
-    """Weight of each pair: smaller where its surfaces agree less than those of the scan's good pairs do.
-
-    On smooth surfaces frames slide: neighbours that are wrong in the same way close cycles with each other and
-    outnumber the right pairs. But they fit a little worse.
-    """
-    fitness = np.array([e.fitness for e in edges])
-    if not len(fitness):
-        return fitness
-    deficit = np.maximum(np.quantile(fitness, GOOD_QUANTILE) - fitness, 0) / FITNESS_SCALE
-    factor = np.array([AMBIGUOUS_WEIGHT if is_ambiguous(e) else 1.0 for e in edges])
-    return np.maximum(np.exp(-(deficit**2)) * factor, LEAST_WEIGHT)
+    """Weight of each pair in a pose graph: about the probability that it is right, by its rivals."""
+    odds = [sum(math.exp(min(rival.log_odds, 0.0)) for rival in e.rivals) for e in edges]
+    return np.maximum(1 / (1 + np.array(odds, dtype=np.float64)), LEAST_WEIGHT)
 
 
-# Search and refinement.
+# Search: similarities from which two surfaces come to agree, wherever that is.
 
 
 def register_pair(
-    maps: tuple[SurfaceMap, SurfaceMap],
+    frames: tuple[Frame, Frame],
     pair: tuple[int, int],
     search: Search,
     rng: np.random.Generator,
     guess: Similarity | None = None,
+    known: Sequence[Similarity] = (),
 ) -> PairMatch | None:
     """Frame `pair[0]` onto frame `pair[1]`; None where no similarity makes anything agree.
 
     With a guess the search rotates it about the object; without one it starts from both cameras looking at the object
-    from the same side.
+    from the same side. `known`: other similarities that are compared as well.
     """
-    source, target = maps
-    if not (source.valid.any() and target.valid.any()):
+    source, target = frames
+    if not (len(source.evidence.points) and len(target.evidence.points)):
         return None
+    found = search_places((source.map, target.map), search, rng, guess)
+    starts = Places.joined([Places.of_hypotheses(found), *([Places.of(*known)] if known else [])])
+    few = PairEvidence(source.evidence, target.evidence, THINNED)
+    places, H = few.refined(starts, SEARCH_WIDTHS)
+    odds = few.log_odds_among_themselves(places)
+    kept = distinct_places(places, np.argsort(-odds, kind="stable").tolist(), target.evidence)
+    way = walk(few, places[kept[:1]], H[kept[0]])
+    fine = PairEvidence(source.evidence, target.evidence)
+    match = best_match(fine, Places.joined([way, places[kept]]), pair)
+    return None if match is None else held_by_tone(fine, match, (source.map, target.map), rng)
+
+
+def search_places(
+    maps: tuple[SurfaceMap, SurfaceMap], search: Search, rng: np.random.Generator, guess: Similarity | None
+) -> Hypotheses:
+    """The best distinct ends of a search on coarse surfaces."""
+    source, target = maps
 
     def sides(count: int) -> Sides:
         return Side.sampled(source, count, rng), Side.sampled(target, count, rng)
 
     found = without_guess(source, target, search) if guess is None else around_guess(target, search, guess)
     few = sides(SEARCH_POINTS)
-    best = _ranked(few, found, SEARCH_TOLERANCE)
-    found = found[best[:COARSE_STARTS]]
+    found = found[_ranked(few, found, SEARCH_TOLERANCE)[:COARSE_STARTS]]
     coarse = sides(COARSE_POINTS)
     for width in COARSE_WIDTHS:
         found = _improved(coarse, found, Tolerance(width, KERNEL_SIGMAS))
-    best = _ranked(coarse, found, COARSE_TOLERANCE)
-    found = found[_distinct(found, best, FINE_STARTS, target)]
-    fine = sides(FINE_POINTS)
-    for width in FINE_WIDTHS:
-        found = _improved(fine, found, Tolerance(width, KERNEL_SIGMAS))
-    common = Tolerance(0.0, _common_width(fine, found))
-    for _ in range(COMMON_STEPS):
-        found = _improved(fine, found, common)
-    return _best_match(fine, found, common, pair)
+    return found[_distinct(found, _ranked(coarse, found, COARSE_TOLERANCE), MOST_PLACES, target)]
 
 
 def search_score(maps: tuple[SurfaceMap, SurfaceMap], search: Search, rng: np.random.Generator) -> float:
@@ -290,7 +285,7 @@ def _improved(sides: Sides, found: Hypotheses, kernel: Tolerance) -> Hypotheses:
     H = H + DAMPING * trace * np.eye(7)
     # Prior of the scale: a departure by its sigma costs as much as all independent points being off by the width.
     width = max(kernel.radii, kernel.sigmas * float(np.median(sides[1].sigma)) / radius)
-    prior = trace[:, 0, 0] / 3 / INDEPENDENT_POINTS * width**2 / SCALE_SIGMA**2
+    prior = trace[:, 0, 0] / 3 / SCALE_POINTS * width**2 / SCALE_SIGMA**2
     H[:, 6, 6] += prior
     g[:, 6] += prior * (log_scale - found.log_scale_prior) * radius
     step = -np.linalg.solve(H, g[..., None])[..., 0] / D
@@ -301,90 +296,143 @@ def _improved(sides: Sides, found: Hypotheses, kernel: Tolerance) -> Hypotheses:
     return found.incremented(step[:, :3], step[:, 3:6], np.exp(bounded) / found.scale, c)
 
 
-def _common_width(sides: Sides, found: Hypotheses) -> float:
-    """Standard deviations within which surfaces agree if they are the same: from the result that agrees most closely.
-
-    How uncertain the surfaces are says how far they may be apart, not how far they are: most of it is common to all
-    points, and a similarity takes it up. What remains shows a relief that would otherwise be lost in it.
-    """
-    sums = agreement(*sides, found, AGREES)
-    likely = sums.agreeing >= LIKELY * sums.agreeing.max()
-    rms = float(np.sqrt(sums.squares[likely].min())) if likely.any() else 0.0
-    return float(np.clip(COMMON_RMS * rms, LEAST_WIDTH, AGREEING_SIGMAS))
+# Comparison of places by their likelihood.
 
 
-def _best_match(sides: Sides, found: Hypotheses, common: Tolerance, pair: tuple[int, int]) -> PairMatch | None:
-    """The result that explains most at the common width, with the others and how far they fall short."""
-    score = agreement(*sides, found, common).score(PENALTY)
-    sums = agreement(*sides, found, AGREES)
-    best, *others = np.argsort(-score, kind="stable").tolist()
-    if sums.agreeing[best] <= 0:
+def best_match(evidence: PairEvidence, starts: Places, pair: tuple[int, int]) -> PairMatch | None:
+    """The most likely of all places, with those that are nearly as likely."""
+    target = evidence.target
+    places, H = evidence.refined(starts, FINE_WIDTHS)
+    found = evidence.compare(places)
+    odds = evidence.log_odds(found, evidence.commonness(found))
+    best = int(np.argmax(odds))
+    if not (found.codes[best] == JUDGED).any():
         return None
-    target = sides[1].map
+    # the peak of a feature is narrow: steps of a walk, or the slope of smooth surface, may miss its top
+    near, H_near = evidence.refined(fine_steps(evidence, places[[best]], H[best]), FINE_WIDTHS)
+    places, H = Places.joined([places, near]), np.concatenate([H, H_near])
+    found = evidence.compare(places)
+    noise = evidence.noise(found, int(np.argmax(evidence.log_odds(found, evidence.commonness(found)))))
+    found = evidence.scaled(found, noise)
+    best = int(np.argmax(evidence.log_odds(found, evidence.commonness(found.chosen(np.arange(len(starts)))))))
+    away = differences(places, places[[best]], target)
+    elsewhere = np.flatnonzero((away[0] > SAME_PLACE_DEG) | (away[1] > SAME_PLACE_SHIFT))
+    common = evidence.commonness(found.chosen(elsewhere))
+    odds = evidence.log_odds(found, evidence.commonness(found.chosen(np.arange(len(starts)))))
+    alone = float(evidence.log_odds(found.chosen(np.array([best])), common)[0])
+    turned, shifted = differences(places, places[[best]], target)
     different: list[int] = []
-    for k in others:
-        if score[k] > 0 and all(_differ(found, k, j, target) for j in [best, *different]):
+    for k in np.argsort(-odds, kind="stable").tolist():
+        apart = differences(places[[k]], places[[best, *different]], target)
+        if ((apart[0] > SAME_PLACE_DEG) | (apart[1] > SAME_PLACE_SHIFT)).all() and odds[k] > odds[best] - MOST_BEHIND:
             different.append(k)
-    rivals = tuple(Rival(found.similarity(k), float(score[k] / max(score[best], 1e-9))) for k in different)
-    match = match_from(pair, found.similarity(best), sums, best, rivals, sides, common)
-    return _held_by_tone(match, sides, common) or match
-
-
-def _held_by_tone(match: PairMatch, sides: Sides, common: Tolerance) -> PairMatch | None:
-    """A pair that slips, turned to where its tones agree; None if it does not slip, or where that is not certain.
-
-    Other results for the pair are passed over: tones were compared all the way around.
-    """
-    if match.slip_deg == 0:
-        return None
-    found = turn_by_tone(sides, match.S_target_source, match.slip_direction, common)
-    if found is None:
-        return None
-    S, sigma_deg = found
-    sums = agreement(*sides, Hypotheses.of(S), AGREES)
-    if sums.fitness[0] < match.fitness - TONE_LARGEST_LOSS:
-        return None
-    by_tone = match.slip_direction, match.slip_deg, sigma_deg
-    return match_from((match.source, match.target), S, sums, 0, (), sides, common, by_tone)
-
-
-def match_from(
-    pair: tuple[int, int],
-    S_target_source: Similarity,
-    found: Agreement,
-    k: int,
-    rivals: tuple[Rival, ...],
-    sides: Sides,
-    common: Tolerance,
-    by_tone: tuple[Float64[ndarray, "7"], float, float] | None = None,
-) -> PairMatch:
-    """The edge for similarity k of `found`, with the uncertainty that follows from the sums and from slipping.
-
-    `by_tone`: the motion along which surfaces slip, by how many degrees, and the sigma in degrees that tones leave.
-    """
-    target = sides[1].map
-    D = np.array([target.radius] * 3 + [1] * 4)
-    H = found.H[k] * D[:, None] * D / target.radius**2
-    # No pair is assumed to fit better than the surfaces are known: errors of the relative pose bend them.
-    typical = float(np.median(target.sigma[target.valid])) / target.radius
-    rms = max(float(np.sqrt(found.squares[k])), 1.0) * typical
-    count = max(np.trace(H[:3, :3]), 1e-9)  # about the sum of the weights
-    information = H * (INDEPENDENT_POINTS / count / rms**2) + LEAST_INFORMATION * np.eye(7)
-    # Errors of the two relative poses move and bend a surface as a whole: more points do not average them.
-    bending = np.array([SHIFT_SIGMAS] * 3 + [TURN_SIGMAS] * 4) * rms
-    covariance = np.linalg.inv(information) + np.diag(bending**2)
-    if by_tone is None:
-        direction = weakest_rotation(information)
-        shape_slip = slip = free = slip_deg(sides, S_target_source, direction, common)
-    else:
-        (direction, shape_slip, free), slip = by_tone, 0.0
-    covariance = covariance + np.radians(free) ** 2 * np.outer(direction, direction)
-    sigma = np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])
-    agreeing, fitness = float(found.agreeing[k]), float(found.fitness[k])
+    likely = odds > odds[best] - LEAST_ODDS
+    slip = float(turned[likely & (shifted < 1.0)].max())
+    direction = weakest_rotation(similarity_information(H[best]))[0]
+    codes, z = found.codes[best], np.abs(found.z[best])  # in units of the noise that was found
+    agreeing = float(((codes == JUDGED) & (z < AGREEING_SIGMAS)).mean())
+    expected = float(((codes == JUDGED) | (codes == ABSENT)).mean())
+    covariance = np.linalg.inv(similarity_information(H[best]) + LEAST_INFORMATION * np.eye(7))
+    covariance *= (ERROR_FACTOR * max(noise)) ** 2
+    covariance += np.diag(np.r_[np.full(3, LEAST_SIGMA_SHIFT), np.full(4, np.radians(LEAST_SIGMA_DEG))] ** 2)
+    slips = slip > BOUNDED_SLIP_DEG
+    covariance += np.radians(slip / 2 if not slips else slip) ** 2 * np.outer(direction, direction)
     return PairMatch(
-        *pair, S_target_source, np.linalg.inv(covariance), agreeing, fitness, rms, rivals, float(np.degrees(sigma)),
-        slip, direction, shape_slip,
+        *pair, places.similarity(best), np.linalg.inv(covariance), agreeing, agreeing / max(expected, 1e-9),
+        alone, tuple(Rival(places.similarity(k), float(odds[k] - odds[best])) for k in different[:MOST_RIVALS]),
+        float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))), slip if slips else 0.0, direction, common, noise,
     )  # fmt: skip
+
+
+def differences(
+    places: Places, other: Places, target: FrameEvidence
+) -> tuple[Float64[ndarray, "k"], Float64[ndarray, "k"]]:
+    """Least angle of each place to the others, degrees, and how far they map what lies in the centroid, in radii."""
+    turn = np.einsum("kij,mij->km", places.R, other.R)
+    angle = np.degrees(np.arccos(np.clip((turn - 1) / 2, -1, 1)))
+    c = target.centroid
+    p = np.einsum("mji,mj->mi", other.R, c - other.t) / other.scale[:, None]
+    at = places.scale[:, None, None] * np.einsum("kij,mj->kmi", places.R, p) + places.t[:, None, :]
+    shift = np.linalg.norm(at - c, axis=-1) / target.radius
+    nearest = np.argmin(angle / SAME_PLACE_DEG + shift / SAME_PLACE_SHIFT, axis=1)
+    rows = np.arange(len(places))
+    return angle[rows, nearest], shift[rows, nearest]
+
+
+def distinct_places(places: Places, ranked: list[int], target: FrameEvidence) -> list[int]:
+    """The ranked ones without those that are close to a better one."""
+    kept: list[int] = []
+    for k in ranked:
+        if kept:
+            turned, shifted = differences(places[[k]], places[kept], target)
+            if turned[0] < SAME_START_DEG and shifted[0] < SAME_PLACE_SHIFT:
+                continue
+        kept.append(k)
+    return kept
+
+
+# A walk along the motion that two frames know least: about the axis of what is nearly round, features make a narrow peak
+# that no slope leads to, and no search with steps of many degrees meets.
+
+
+def similarity_information(H: Float64[ndarray, "17 17"]) -> Float64[ndarray, "7 7"]:
+    """What is known of the similarity while the errors of both relative poses are free (Schur complement)."""
+    return H[:7, :7] - H[:7, 7:] @ np.linalg.solve(H[7:, 7:], H[7:, :7])
+
+
+def weakest_rotation(
+    information: Float64[ndarray, "7 7"],
+) -> tuple[Float64[ndarray, "7"], Float64[ndarray, "3"]]:
+    """The increment (v, w, l) with |w| = 1 that is known least, with translation and scale free to follow, and what is
+    known of all rotations, smallest first.
+    """
+    other = [0, 1, 2, 6]
+    follow = -np.linalg.lstsq(information[np.ix_(other, other)], information[other][:, 3:6], rcond=1e-10)[0]
+    reduced = information[3:6, 3:6] + information[3:6][:, other] @ follow
+    values, vectors = np.linalg.eigh(reduced)
+    w = vectors[:, 0]
+    x = np.zeros(7)
+    x[3:6], x[other] = w, follow @ w
+    return x, values
+
+
+def moved_along(place: Places, direction: Float64[ndarray, "7"], angle: float, target: FrameEvidence) -> Places:
+    """A screw motion about the axis that a motion (v, w, l) has; its growth is left to refinement."""
+    w, v = direction[3:6], direction[:3] * target.radius
+    on_axis = target.centroid + np.cross(w, v)
+    E = Rotation.from_rotvec(w * angle).as_matrix()
+    t = on_axis + (place.t - on_axis) @ E.T + w * (w @ v) * angle
+    return Places(place.scale, E @ place.R, t, place.errors)
+
+
+def walk(evidence: PairEvidence, start: Places, H: Float64[ndarray, "17 17"]) -> Places:
+    """Places a step apart in both senses, until they are unlikely; all but the rotation follows the surfaces."""
+    target, first, way = evidence.target, evidence.compare(start), [start]
+    for sense in (1.0, -1.0):
+        place, information = start, H
+        last = sense * weakest_rotation(similarity_information(H))[0]
+        for _ in range(MOST_STEPS):
+            direction = weakest_rotation(similarity_information(information))[0]
+            cosine = direction[3:6] @ last[3:6]
+            if abs(cosine) < LEAST_STRAIGHT:
+                break
+            last = direction * np.sign(cosine)
+            place = moved_along(place, last, np.radians(STEP_DEG), target)
+            place, each = evidence.refined(place, WALK_WIDTHS, axis=last[None, 3:6])
+            information = each[0]
+            here = evidence.compare(place)
+            if evidence.lead(first, here) > MOST_BEHIND or not here.overlaps(first, LEAST_OVERLAP_OF_WALK):
+                break
+            way.append(place)
+    return Places.joined(way)
+
+
+def fine_steps(evidence: PairEvidence, place: Places, H: Float64[ndarray, "17 17"]) -> Places:
+    """Places along the weakest motion closer to each other than the steps of a walk."""
+    direction = weakest_rotation(similarity_information(H))[0]
+    steps = np.linspace(-STEP_DEG, STEP_DEG, FINE_STEPS)
+    moved = Places.joined([moved_along(place, direction, np.radians(step), evidence.target) for step in steps])
+    return evidence.refined(moved, WALK_WIDTHS, axis=np.tile(direction[3:6], (FINE_STEPS, 1)))[0]
 
 
 # Similarities to start from.
@@ -429,84 +477,6 @@ def without_guess(source: SurfaceMap, target: SurfaceMap, search: Search) -> Hyp
     return Hypotheses.joined(parts)
 
 
-# Slip: a table, or a vase without texture, looks the same after some motions. The normal equations do not show it,
-# because noise of the normals makes information where there is none. So the motion that they know least is tried.
-
-
-def weakest_rotation(information: Float64[ndarray, "7 7"]) -> Float64[ndarray, "7"]:
-    """The increment (v, w, l) with |w| = 1 that is known least, with translation and scale free to follow."""
-    other = [0, 1, 2, 6]
-    follow = -np.linalg.solve(information[np.ix_(other, other)], information[other][:, 3:6])
-    reduced = information[3:6, 3:6] + information[3:6][:, other] @ follow
-    w = np.linalg.eigh(reduced)[1][:, 0]
-    x = np.zeros(7)
-    x[3:6], x[other] = w, follow @ w
-    return x
-
-
-def motion_cost(sides: Sides, still: Similarity, moved: Similarity, kernel: Tolerance) -> Float64[ndarray, "2 4"]:
-    """Robust costs of a motion from one similarity to another, sums that may be added over pairs of frames.
-
-    Rows: all points of both frames, and those that the motion moves along their normals. Points that stay on their own
-    tangent plane carry no information: those of a vase that turns about its axis, or of the table below it. Columns:
-    sum of the costs before and after, and how many points the other frame can judge before and after, in shares of all.
-    """
-    source, target = sides
-    both = Hypotheses.of(still, moved)
-    some = _moved_points(source, still, moved), _moved_points(target, still.inverse(), moved.inverse())
-    share = (len(some[0].points) / len(source.points) + len(some[1].points) / len(target.points)) / 2
-    out = np.empty((2, 4))
-    for row, (points, part) in zip(out, ((sides, 1.0), (some, share)), strict=True):
-        found = agreement(*points, both, kernel)
-        row[2:] = part * found.judged
-        row[:2] = found.cost * row[2:]
-    return out
-
-
-def rise_of(costs: Float64[ndarray, "2 4"]) -> float:
-    """The larger rise of the mean cost, of all points or of those that a motion moves.
-
-    In units of a rise of all points: the standard error of a mean over a share of the points is larger by the inverse
-    root of that share, so few points must notice a motion all the more.
-    """
-    rises = [
-        moved / judged_moved - still / judged_still if min(judged_still, judged_moved) > 0 else 0.0
-        for still, moved, judged_still, judged_moved in costs.tolist()
-    ]
-    share = costs[1, 2] / max(costs[0, 2], 1e-9)
-    return max(rises[0], rises[1] * float(np.sqrt(share)))
-
-
-def _moved_points(side: Side, still: Similarity, moved: Similarity) -> Side:
-    """The points that a motion moves along their normals by more than SLIP_SIGMAS of both surfaces."""
-    step = moved.points(side.points) - still.points(side.points)
-    along = np.abs((step * (side.normals @ still.R.T)).sum(1))
-    some = along > SLIP_SIGMAS * 2**0.5 * still.scale * side.sigma
-    return Side(side.map, side.points[some], side.normals[some], side.sigma[some])
-
-
-def slip_deg(sides: Sides, S_target_source: Similarity, direction: Float64[ndarray, "7"], common: Tolerance) -> float:
-    """The largest of some angles, in degrees, up to which a motion in either sense is not noticed; 0 where all are.
-
-    A motion is noticed where the mean robust cost of all points, or of those that it moves, rises, with a kernel as
-    narrow as the surfaces agree, though everything but its rotation may follow: the axis of a surface of revolution is
-    never known exactly.
-    """
-    surface, unit = sides[1].map, Tolerance(0.0, common.sigmas / COMMON_RMS)
-    angles = np.array([0.0, *SLIP_ANGLES_DEG])
-    rise = np.full(len(angles) - 1, np.inf)
-    for sense in (1.0, -1.0):
-        motions = [screw_motion(sense * angle * direction, surface) for angle in np.radians(angles)]
-        moved = Hypotheses.of(*(motion @ S_target_source for motion in motions))
-        for _ in range(SLIP_STEPS):
-            moved = followed(sides, moved, direction[3:6], Tolerance(0.0, common.sigmas))
-        still, *others = (moved.similarity(k) for k in range(len(angles)))
-        rises = [rise_of(motion_cost(sides, still, other, unit)) for other in others]
-        rise = np.minimum(rise, rises)
-    noticed = np.flatnonzero(rise > SLIP_RISE)
-    return float(angles[noticed[0]] if len(noticed) else angles[-1])
-
-
 def followed(sides: Sides, moved: Hypotheses, held: Float64[ndarray, "3"], kernel: Tolerance) -> Hypotheses:
     """Take a Gauss-Newton step of each that does not rotate about the axis `held`."""
     target = sides[1].map
@@ -539,6 +509,34 @@ def screw_motion(x: Float64[ndarray, "7"], surface: SurfaceMap) -> Similarity:
 # tried, and the place where the tones of both frames are most alike is taken if it is clearly better than all others.
 
 
+def held_by_tone(
+    evidence: PairEvidence, match: PairMatch, maps: tuple[SurfaceMap, SurfaceMap], rng: np.random.Generator
+) -> PairMatch:
+    """A pair that slips, turned to where its tones agree; as it is if it does not slip, or that is not certain.
+
+    Other places of the pair are passed over: tones were compared all the way around.
+    """
+    if match.holds:
+        return match
+    sides = Side.sampled(maps[0], TONE_FOLLOWED_POINTS, rng), Side.sampled(maps[1], TONE_FOLLOWED_POINTS, rng)
+    turned = turn_by_tone(sides, match.S_target_source, match.slip_direction, Tolerance(0.0, TONE_SIGMAS))
+    if turned is None:
+        return match
+    S, sigma_deg = turned
+    places, _ = evidence.refined(Places.of(S), WALK_WIDTHS, axis=match.slip_direction[None, 3:6])
+    both = Places.joined([Places.of(match.S_target_source), places])
+    found = evidence.compare(evidence.refined(both, FINE_WIDTHS, axis=np.tile(match.slip_direction[3:6], (2, 1)))[0])
+    odds = evidence.log_odds(found, match.common)
+    if odds[1] < odds[0] - TONE_LARGEST_LOSS:
+        return match
+    d, slip = match.slip_direction, np.radians(match.slip_deg)
+    covariance = np.linalg.inv(match.information) + (np.radians(sigma_deg) ** 2 - slip**2) * np.outer(d, d)
+    return replace(
+        match, S_target_source=places.similarity(0), information=np.linalg.inv(covariance), rivals=(), slip_deg=0.0,
+        rotation_sigma_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))), by_shape=match,
+    )  # fmt: skip
+
+
 def turn_by_tone(
     sides: Sides, S_target_source: Similarity, direction: Float64[ndarray, "7"], common: Tolerance
 ) -> tuple[Similarity, float] | None:
@@ -556,7 +554,7 @@ def turn_by_tone(
         return None  # both cameras see it from the same side: what light and view make there looks the same, too
     rest = np.radians(peak.offset_deg) * direction
     turned = Hypotheses.of(screw_motion(rest, sides[1].map) @ way.similarity(peak.index))
-    for _ in range(SLIP_STEPS):
+    for _ in range(TONE_FINAL_STEPS):
         turned = followed(sides, turned, direction[3:6], common)
     return turned.similarity(0), max(peak.sigma_deg, TONE_LEAST_SIGMA_DEG)
 

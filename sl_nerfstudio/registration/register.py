@@ -16,29 +16,25 @@ from numpy import ndarray
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, angle_deg
 from sl_nerfstudio.parallel import one_library_thread, results, tracked
-from sl_nerfstudio.registration.agreement import AGREES, PENALTY, agreement_at
+from sl_nerfstudio.registration.agreement import PENALTY
 from sl_nerfstudio.registration.assembly import (
-    INNER_MISFIT_FACTOR,
-    Assembly,
     Component,
     PoseGraphSolution,
-    see_same_side,
+    facing,
 )
+from sl_nerfstudio.registration.evidence import Frame, ScanEvidence
 from sl_nerfstudio.registration.pairs import (
     ANYWHERE,
     KERNEL_SIGMAS,
-    LEAST_FITNESS,
-    LEAST_OVERLAP,
+    LEAST_ODDS,
     NEIGHBOURS,
     SAME_ROTATION_DEG,
     PairMatch,
     Search,
     is_accepted,
     is_ambiguous,
-    quality,
     register_pair,
     search_score,
-    support,
 )
 from sl_nerfstudio.registration.result import (
     Edge,
@@ -53,21 +49,14 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
     UndecidedProjector,
 )
-from sl_nerfstudio.registration.surfaces import FrameCloud, SurfaceMap, build_surface_map
-from sl_nerfstudio.registration.symmetry import (
-    DIFFERENT_SIDES_DEG,
-    SEQUENCE_GAPS,
-    chain_of_small_steps,
-    sides_are_open,
-    symmetric_turns_deg,
-    turn_blocks_back,
-    typical_step_deg,
-)
+from sl_nerfstudio.registration.surfaces import FrameCloud
+from sl_nerfstudio.registration.symmetry import symmetric_turns_deg
 from sl_nerfstudio.registration.view_graph import ViewGraph, starting_similarities, with_common_centre
 
+SEQUENCE_GAPS = (1, 2)  # differences between the numbers of frames that are paired in a sequence
 ROUNDS = 2  # of closing cycles
 LEAST_JOINED = 0.5  # share of successive frames that must be joined for their order to be that of capture
-LEAST_FRAME_FITNESS = 0.55  # share of a frame's points, of those that other frames can judge, which must agree
+FACING = 8  # frames with which each is compared at last
 MOST_DOUBTFUL = 0.25  # share of the frames most of whose pairs contradict the pose found; more: the pairs are to blame
 LARGEST_SIGMA_ROTATION_DEG = 3.0  # standard deviation of the least known rotation beyond which it is uncertain
 UNKNOWN_SIGMA_ROTATION_DEG = 104.0  # the same where the rotation is unobservable: of all angles from -180 to 180
@@ -94,10 +83,11 @@ def register(
     """
     report = progress or (lambda _: None)
     n = len(clouds)
-    maps = tracked([partial(build_surface_map, c) for c in clouds], "averaging surfaces")
+    frames = tracked([partial(Frame.of, c) for c in clouds], "averaging surfaces")
+    maps = [frame.map for frame in frames]
     rough = {} if start is None else starting_similarities(start, maps)
     centred = with_common_centre(rough, maps)
-    graph = ViewGraph(maps, centred, np.random.default_rng(seed))
+    graph = ViewGraph(frames, centred, np.random.default_rng(seed))
     report("registering pairs")
     if start is not None:
         graph.try_overlapping(rough)
@@ -106,10 +96,11 @@ def register(
     if start is None and sequence:
         for gap in SEQUENCE_GAPS:
             graph.try_pairs([(k, k + gap) for k in range(n - gap)], NEIGHBOURS)
+        graph.learn_step()
         ordered = _in_order(graph.assemble(), n)
     if start is None and not ordered:
         report("comparing all frames")
-        graph = ViewGraph(maps, centred, np.random.default_rng(seed))  # what chance neighbours say is no help
+        graph = ViewGraph(frames, centred, np.random.default_rng(seed))  # what chance neighbours say is no help
         graph.try_all()
     for _ in range(ROUNDS):
         report("closing loops")
@@ -117,30 +108,7 @@ def register(
         for component in (c for c in components if len(c) > 1):
             graph.try_overlapping(graph.solve(component).S_world_camera)
         graph.bridge(components)
-    turn_blocks_back(graph)
-    names = tuple(c.name for c in clouds)
-    found = accept_frames(names, graph, ordered)
-    most_are_lost = found.registered.sum() <= n / 2
-    if start is None and sequence and (found.turns_deg or most_are_lost):
-        return _by_order(names, graph) or found
-    return found
-
-
-def _by_order(names: tuple[str, ...], graph: ViewGraph) -> Registration | None:
-    """Frames that fit at several sides of the object, placed by the order of capture; None if that places few.
-
-    `graph` is without it: frames are at other sides than they show, or most could not be placed.
-    """
-    step_deg = typical_step_deg(graph.matches)
-    if step_deg is None or not sides_are_open(graph.said):
-        return None
-    chain = chain_of_small_steps(graph.maps, step_deg, graph.rng)
-    near = ViewGraph(graph.maps, {}, graph.rng)
-    near.try_overlapping(chain, DIFFERENT_SIDES_DEG)
-    for _ in range(ROUNDS):
-        near.try_overlapping(near.solve(near.assemble()[0]).S_world_camera, DIFFERENT_SIDES_DEG)
-    placed = accept_frames(names, near, True, graph.said)
-    return replace(placed, by_order=True) if placed.registered.sum() > len(names) / 2 else None
+    return accept_frames(tuple(c.name for c in clouds), graph, ordered)
 
 
 def _in_order(components: Sequence[Component], n: int) -> bool:
@@ -153,24 +121,18 @@ def _in_order(components: Sequence[Component], n: int) -> bool:
 # Which frames are registered in the end, why the others are not, and what is uncertain.
 
 
-def accept_frames(
-    names: tuple[str, ...], graph: ViewGraph, ordered: bool, others: Sequence[PairMatch] = ()
-) -> Registration:
-    """Poses and baselines of the largest component; every other frame with its reason.
-
-    `others`: pairs that are not in the graph, and may say that the surface looks the same after a turn.
-    """
+def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Registration:
+    """Poses and baselines of the largest component; every other frame with its reason."""
     components = graph.assemble()
     edges = graph.holding(components[0])
     main = components[0] if len(components[0]) > 1 else {}
     component = _numbers(components, len(names))
     solution = graph.solve(components[0])
     connected = component == 0
-    tasks = [
-        partial(_fitness_of, k, solution, connected, graph, own) for k, own in enumerate(graph.rng.spawn(len(names)))
-    ]
-    fitness = np.array(results(tasks))
-    agrees = connected & (fitness >= LEAST_FRAME_FITNESS)
+    scan = graph.evidence()
+    tasks = [partial(_support_of, k, solution, scan) for k in range(len(names))]
+    odds, fitness = np.array(results(tasks)).T
+    agrees = connected & (odds > LEAST_ODDS)
     doubts = _doubtful(names, agrees, edges, solution.consistent)
     few = len(doubts) <= MOST_DOUBTFUL * agrees.sum()
     registered = agrees & ~np.isin(np.arange(len(names)), list(doubts)) if few else agrees
@@ -202,8 +164,9 @@ def accept_frames(
         ),
         tuple(UncertainRotation(names[k], sigma[k]) for k in index if sigma[k] > LARGEST_SIGMA_ROTATION_DEG),
         tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
-        symmetric_turns_deg(graph.sides, edges, solution, [*others, *graph.put_aside]),
+        symmetric_turns_deg(edges, solution),
         ordered,
+        graph.by_order,
     )  # fmt: skip
 
 
@@ -217,7 +180,7 @@ def _doubtful(
         mine = [(e, bool(u)) for e, u in zip(edges, consistent, strict=True) if k in (e.source, e.target)]
         mine = [(e, used) for e, used in mine if inside[e.other(k)] and not is_ambiguous(e)]
         against = [e for e, used in mine if not used]
-        if math.fsum(map(support, against)) > math.fsum(support(e) for e, used in mine if used):
+        if math.fsum(e.log_odds for e in against) > math.fsum(e.log_odds for e, used in mine if used):
             found[k] = PairsContradict(names[k], len(mine), len(against))
     return found
 
@@ -237,20 +200,18 @@ def _numbers(components: Sequence[Component], n: int) -> Int64[ndarray, "n"]:
     return number
 
 
-def _fitness_of(
-    k: int, solution: PoseGraphSolution, connected: Bool[ndarray, "n"], graph: ViewGraph, rng: np.random.Generator
-) -> float:
-    """Share of a frame's points that agrees, of those that other frames can judge."""
-    if not connected[k]:
-        return 0.0
-    S, agreeing, expected = solution.S_world_camera[k], 0.0, 0.0
-    for j, other in solution.S_world_camera.items():
-        if j == k or not see_same_side(S, other):
-            continue
-        found = agreement_at((graph.maps[k], graph.maps[j]), other.inverse() @ S, rng, AGREES)
-        agreeing += found.agreeing[0]
-        expected += found.expected[0]
-    return agreeing / expected if expected else 0.0
+def _support_of(k: int, solution: PoseGraphSolution, scan: ScanEvidence) -> tuple[float, float]:
+    """Log-odds of a frame's place against the frames that face it, and the share of points that agree with theirs."""
+    nodes = solution.S_world_camera
+    if k not in nodes:
+        return 0.0, 0.0
+    others = {j: S for j, S in nodes.items() if j != k}
+    found = [
+        scan.agreement(i, j, nodes[j].inverse() @ nodes[i])
+        for i, j in facing({k: nodes[k]}, others, Similarity.identity(), FACING)
+    ]
+    odds, agreeing, expected = (math.fsum(each) for each in zip(*found, strict=True)) if found else (0.0, 0.0, 0.0)
+    return odds, agreeing / expected if expected else 0.0
 
 
 def _in_first_camera(
@@ -279,17 +240,17 @@ def _exclusion(
     mine = [e for e in graph.matches if k in (e.source, e.target)]
     if not mine:
         return NoCommonSurface(names[k])
-    best = max(mine, key=lambda e: quality(e))
+    best = max(mine, key=lambda e: e.log_odds)
     if not is_accepted(best):
         partner = names[best.other(k)]
-        return PoorPair(names[k], partner, best.overlap, best.fitness, LEAST_OVERLAP, LEAST_FITNESS)
+        return PoorPair(names[k], partner, best.overlap, best.fitness, best.log_odds, LEAST_ODDS)
     component = next(c for c in components if k in c)
     across = [
         (e, e.source if e.source in main else e.target)
         for e in graph.matches
         if (e.source in main and e.target in component) or (e.target in main and e.source in component)
     ]
-    partner = names[max(across, key=lambda pair: quality(pair[0]))[1]] if across else None
+    partner = names[max(across, key=lambda pair: pair[0].log_odds)[1]] if across else None
     # where no two frames could be joined, every pair of the frame might have joined it
     joining = [e for e in ([e for e, _ in across] if main else mine) if is_accepted(e)]
     slips = bool(joining) and all(e.slip_deg > 0 for e in joining)
@@ -341,7 +302,7 @@ def include_left_out(
 
     `clouds` have the adjusted relative poses; poses of frames that are not registered are NaN.
     """
-    graph = ViewGraph([build_surface_map(c) for c in clouds], {}, np.random.default_rng(seed))
+    graph = ViewGraph([Frame.of(c) for c in clouds], {}, np.random.default_rng(seed))
     main: Component = {
         k: Similarity(float(adjusted.baseline[k]), T[:3, :3], T[:3, 3])
         for k, T in enumerate(adjusted.T_world_camera)
@@ -349,15 +310,12 @@ def include_left_out(
     }
     for k in left_out:
         graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), ANYWHERE)
-    used = [e.fitness for e in registration.edges if e.used]
-    firm, slipping = [e for e in graph.edges if e.holds], [e for e in graph.edges if not e.holds]
-    # after the adjustment right frames fit as well as the others do
-    assembly = Assembly(graph.sides, graph.pivots, firm, slipping, used or None, INNER_MISFIT_FACTOR)
+    assembly = graph.assembly([e for e in graph.edges if e.holds])
     placed: Component = {}
     singles: list[Component] = [{k: Similarity.identity()} for k in left_out]
     for block in (*_blocks(registration, left_out), *singles):
         joint = None if block.keys() <= placed.keys() else assembly.decide(main, block)
-        if joint is not None and joint.links > 1:
+        if joint is not None:
             placed |= {k: joint.S_first_second @ S for k, S in block.items()}
     return _with_frames(registration, adjusted, placed)
 
@@ -430,11 +388,11 @@ def choose_projectors(clouds: Sequence[FrameCloud], sequence: bool = True, seed:
     choices = [(c, *c.alternatives) for c in clouds]
     chosen, undecided = [0] * len(clouds), []
     open_frames = [k for k, every in enumerate(choices) if len(every) > 1]
-    built = iter(results([partial(build_surface_map, c) for every in choices for c in every]) if open_frames else [])
-    maps = [[next(built) for _ in every] for every in choices] if open_frames else []
+    built = iter(results([partial(Frame.of, c) for every in choices for c in every]) if open_frames else [])
+    frames = [[next(built) for _ in every] for every in choices] if open_frames else []
     rng = np.random.default_rng(seed)
     for k in track(open_frames, "comparing poses of projectors"):
-        scores = _support_of_choices(k, maps, sequence, rng)
+        scores = _support_of_choices(k, frames, sequence, rng)
         best = chosen[k] = int(np.argmax(scores))
         rivals = [h for h, score in enumerate(scores) if h != best and score >= RIVAL * scores[best]]
         if rivals:
@@ -444,32 +402,32 @@ def choose_projectors(clouds: Sequence[FrameCloud], sequence: bool = True, seed:
 
 
 def _support_of_choices(
-    k: int, maps: Sequence[Sequence[SurfaceMap]], sequence: bool, rng: np.random.Generator
+    k: int, frames: Sequence[Sequence[Frame]], sequence: bool, rng: np.random.Generator
 ) -> list[float]:
     """Sum up, for every cloud of a frame, what agrees with its neighbours, less what contradicts."""
-    partners = _partners(k, maps, sequence, rng)
-    pairs = [(own, maps[j]) for own in maps[k] for j in partners]
+    partners = _partners(k, frames, sequence, rng)
+    pairs = [(own, frames[j]) for own in frames[k] for j in partners]
     search = NEIGHBOURS if sequence else ANYWHERE
     tasks = [
         partial(_best_agreement, *pair, search, own) for pair, own in zip(pairs, rng.spawn(len(pairs)), strict=True)
     ]
-    return np.reshape(results(tasks), (len(maps[k]), -1)).sum(1).tolist()
+    return np.reshape(results(tasks), (len(frames[k]), -1)).sum(1).tolist()
 
 
-def _partners(k: int, maps: Sequence[Sequence[SurfaceMap]], sequence: bool, rng: np.random.Generator) -> list[int]:
+def _partners(k: int, frames: Sequence[Sequence[Frame]], sequence: bool, rng: np.random.Generator) -> list[int]:
     """Frames taken shortly before and after; of an unordered set those that look most alike."""
-    n = len(maps)
+    n = len(frames)
     if sequence:
         return [j for j in range(max(0, k - REACH), min(n, k + REACH + 1)) if j != k]
     others = [j for j in range(n) if j != k]
     tasks = [
-        partial(search_score, (maps[k][0], maps[j][0]), ANYWHERE, own)
+        partial(search_score, (frames[k][0].map, frames[j][0].map), ANYWHERE, own)
         for j, own in zip(others, rng.spawn(len(others)), strict=True)
     ]
     return [others[i] for i in np.argsort(-np.array(results(tasks)), kind="stable")[: 2 * REACH]]
 
 
-def _best_agreement(own: SurfaceMap, partner: Sequence[SurfaceMap], search: Search, rng: np.random.Generator) -> float:
+def _best_agreement(own: Frame, partner: Sequence[Frame], search: Search, rng: np.random.Generator) -> float:
     best = 0.0
     for other in partner:
         match = register_pair((own, other), (0, 1), search, rng)

@@ -61,8 +61,8 @@ class PoorPair:
     partner: str
     overlap: float  # share of the points that agree
     fitness: float  # share of those that could be judged
-    least_overlap: float  # that a pair must have
-    least_fitness: float
+    log_odds: float  # that they have a surface in common, nats
+    least_odds: float
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -14,7 +14,6 @@ from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.parallel import tracked
 from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, COARSE_POINTS, Side, Tolerance, agreement_at
 from sl_nerfstudio.registration.assembly import (
-    SAME_SIDE_DEG,
     Assembly,
     Component,
     Pivots,
@@ -22,8 +21,10 @@ from sl_nerfstudio.registration.assembly import (
     optimise_pose_graph,
     see_same_side,
 )
+from sl_nerfstudio.registration.evidence import Commonness, Frame, ScanEvidence
 from sl_nerfstudio.registration.pairs import (
     ANYWHERE,
+    LEAST_ODDS,
     NEARBY,
     ROUGH,
     SAME_ROTATION_DEG,
@@ -32,7 +33,6 @@ from sl_nerfstudio.registration.pairs import (
     Search,
     edge_weights,
     is_accepted,
-    quality,
     register_pair,
     search_score,
 )
@@ -47,6 +47,11 @@ BRIDGED = 4  # components, the largest ones, that are bridged with all others
 BRIDGES = 8  # pairs of frames across two components that are registered in order to join them
 BRIDGES_COMPARED = 40  # pairs across of which those that look most alike are chosen
 BRIDGES_NEARBY = 3  # how many of the bridges are pairs taken one soon after the other
+LEAST_STEPS = 0.5  # share of the successive frames that must fit each other for their usual step to be known
+LEAST_STEP_DEG = 2.0  # of successive frames
+STEPS_SIGMA = 1.0  # of the prior: one usual step
+LARGEST_GAP = 2  # between frames of which the order of capture says something
+MOST_BY_ORDER = 25.0  # nats against a place by the order: someone may have walked to the other side
 LEAST_DISTANCE = 0.2  # of a camera from the object, relative to the median, for its rough pose to be used
 
 # Pairs that only tones hold: where the shape leaves a turn open, two tones may agree by accident anywhere. Three pairs
@@ -66,7 +71,7 @@ def with_confirmed_tones(edges: Sequence[PairMatch], pivots: Pivots) -> list[Pai
         around = (there[k].between(k, e.target) @ here[k].between(e.source, k) for k in here.keys() & there.keys())
         return any(_same(e.S_target_source, S, pivots, e.source) for S in around)
 
-    return [e.without_tone() if e.by_tone and not confirmed(e) else e for e in edges]
+    return [e.by_shape if e.by_shape is not None and not confirmed(e) else e for e in edges]
 
 
 def _same(a: Similarity, b: Similarity, pivots: Pivots, frame: int) -> bool:
@@ -121,21 +126,22 @@ def with_common_centre(S_world_camera: Component, maps: Sequence[SurfaceMap]) ->
 
 
 Pair = tuple[int, int]
-Snapshot = tuple[dict[Pair, PairMatch | None], list[PairMatch]]  # what pairs say, and what was put aside
 
 
 class ViewGraph:
     """Pairs that were tried, with the best result of each."""
 
-    def __init__(self, maps: list[SurfaceMap], start: Component, rng: np.random.Generator) -> None:
-        self.maps = maps
+    def __init__(self, frames: list[Frame], start: Component, rng: np.random.Generator) -> None:
+        self.frames = frames
+        self.maps = [frame.map for frame in frames]
         self.rng = rng
         self._start = start  # S_world_camera of frames where it is known roughly
-        self.pivots = Pivots(np.stack([m.centroid for m in maps]), np.array([m.radius for m in maps]))
-        self.sides = [Side.sampled(m, COARSE_POINTS, rng) for m in maps]
+        self.pivots = Pivots(np.stack([m.centroid for m in self.maps]), np.array([m.radius for m in self.maps]))
+        self.sides = [Side.sampled(m, COARSE_POINTS, rng) for m in self.maps]
+        self.step_deg: float | None = None  # by which successive frames usually turn; None: the order says nothing
         self._tried: dict[Pair, PairMatch | None] = {}
         self._searched: set[tuple[Pair, Search]] = set()
-        self.put_aside: list[PairMatch] = []  # what put blocks of frames where most of the surface contradicts it
+        self.by_order = False  # the order of capture has decided places that surfaces did not
 
     @property
     def matches(self) -> list[PairMatch]:
@@ -147,35 +153,6 @@ class ViewGraph:
         """Pairs that agree well enough; what only the tones of two frames say counts if a third frame confirms it."""
         accepted = [match for match in self.matches if is_accepted(match)]
         return with_confirmed_tones(accepted, self.pivots)
-
-    @property
-    def said(self) -> list[PairMatch]:
-        """All results of pairs, right or not: at which sides of the object frames fit."""
-        return [*self.matches, *self.put_aside]
-
-    def set_aside(self, S_world_camera: Component, pairs: Sequence[Pair]) -> None:
-        """Forget what pairs (in any order) say if it is another rotation than that of the given poses."""
-        for pair in sorted({(min(p), max(p)) for p in pairs}):
-            match = self._tried.get(pair)
-            if match is None:
-                continue
-            placed = S_world_camera[match.target].inverse() @ S_world_camera[match.source]
-            if _turned_deg(match, placed) > SAME_SIDE_DEG:
-                self.put_aside.append(match)
-                del self._tried[pair]
-
-    def snapshot(self) -> Snapshot:
-        """What pairs say now, to come back to."""
-        return dict(self._tried), list(self.put_aside)
-
-    def restore(self, known: Snapshot) -> None:
-        """Make pairs say what they said."""
-        self._tried, self.put_aside = dict(known[0]), list(known[1])
-
-    def connected(self, component: Component, used: Bool[ndarray, "edges"]) -> bool:
-        """Whether those of the pairs that hold a component which are `used` lead to every frame of it."""
-        held = zip(self.holding(component), used, strict=True)
-        return _connected(component, [edge for edge, here in held if here])
 
     def try_pairs(self, pairs: Sequence[Pair], search: Search) -> None:
         """Register pairs without a guess, or from the rough poses of both where there are any."""
@@ -234,11 +211,45 @@ class ViewGraph:
         Pairs that may slip connect nothing, unless all of them may: then the surface is one of revolution, and its
         frames are put together all the same.
         """
-        firm, slipping = [e for e in self.edges if e.holds], [e for e in self.edges if not e.holds]
-        components = Assembly(self.sides, self.pivots, firm, slipping).grow()
+        edges = self.edges
+        assembly = self.assembly([e for e in edges if e.holds])
+        components = assembly.grow()
+        self.by_order = assembly.by_order
         if len(components[0]) > 1:
             return components
-        return Assembly(self.sides, self.pivots, self.edges).grow()
+        return self.assembly(edges, slipping=True).grow()
+
+    def assembly(self, edges: Sequence[PairMatch], slipping: bool = False) -> Assembly:
+        """Frames that pairs may join."""
+        return Assembly(self.evidence(), self.pivots, edges, self.usual_step, slipping)
+
+    def evidence(self) -> ScanEvidence:
+        """All frames, with what pairs have shown of their points."""
+        frames = [frame.evidence for frame in self.frames]
+        common = [Commonness.none(len(frame.points)) for frame in frames]
+        noise: list[list[float]] = [[] for _ in frames]
+        for match in self.matches:
+            for k, each, size in zip((match.source, match.target), match.common, match.noise, strict=True):
+                common[k] = common[k] + each
+                noise[k].append(size)
+        return ScanEvidence(frames, common, np.array([np.median(each) if each else 1.0 for each in noise]))
+
+    def learn_step(self) -> None:
+        """How much successive frames usually turn: the median of the least turn that each pair of them allows."""
+        steps = [
+            min(angle_deg(S.R) for S in likely_places(e))
+            for e in self.edges
+            if abs(e.target - e.source) == 1 and e.holds
+        ]
+        enough = len(steps) > LEAST_STEPS * (len(self.frames) - 1)
+        self.step_deg = max(float(np.median(steps)), LEAST_STEP_DEG) if enough else None
+
+    def usual_step(self, i: int, j: int, S_i_j: Similarity) -> float:
+        """Log-odds of the place of one frame on another by the order of capture: small steps are likely."""
+        gap = abs(i - j)
+        if self.step_deg is None or gap > LARGEST_GAP:
+            return 0.0
+        return -min(0.5 * (angle_deg(S_i_j.R) / (STEPS_SIGMA * gap * self.step_deg)) ** 2, MOST_BY_ORDER)
 
     def solve(self, component: Component) -> PoseGraphSolution:
         """A component with the pairs that hold it optimised together."""
@@ -255,14 +266,13 @@ class ViewGraph:
         """Register pairs, and keep the better result of a pair that was tried before."""
         rngs = self.rng.spawn(len(trials))
         tasks = [
-            partial(register_pair, self._maps(pair), pair, search, rng, guess)
+            partial(register_pair, self._frames(pair), pair, search, rng, guess, self._known(pair))
             for (pair, search, guess), rng in zip(trials, rngs, strict=True)
         ]
         for (pair, _, guess), match in zip(trials, tracked(tasks, words), strict=True):
             if match is not None and guess is not None and _turned_deg(match, guess) > within_deg:
                 continue
-            known = self._tried.get(pair)
-            if known is None or (match is not None and quality(match) > quality(known)):
+            if match is not None or pair not in self._tried:
                 self._tried[pair] = match
 
     def _likeness(self, pairs: Sequence[Pair]) -> list[float]:
@@ -270,6 +280,14 @@ class ViewGraph:
         rngs = self.rng.spawn(len(pairs))
         tasks = [partial(search_score, self._maps(pair), ANYWHERE, rng) for pair, rng in zip(pairs, rngs, strict=True)]
         return tracked(tasks, "comparing frames")
+
+    def _frames(self, pair: Pair) -> tuple[Frame, Frame]:
+        return self.frames[pair[0]], self.frames[pair[1]]
+
+    def _known(self, pair: Pair) -> list[Similarity]:
+        """Places of a pair that an earlier search has found."""
+        match = self._tried.get(pair)
+        return [] if match is None else likely_places(match)
 
     def _maps(self, pair: Pair) -> tuple[SurfaceMap, SurfaceMap]:
         return self.maps[pair[0]], self.maps[pair[1]]
@@ -295,6 +313,13 @@ class ViewGraph:
                     pairs.add((min(i, j), max(i, j)))
         edges = {pair for pair, match in self._tried.items() if match is not None and is_accepted(match)}
         return sorted(pairs - edges)
+
+
+def likely_places(match: PairMatch) -> list[Similarity]:
+    """Where a pair may belong: its best place, and those that are nearly as likely."""
+    return [
+        match.S_target_source, *(r.S_target_source for r in match.rivals if r.log_odds > -LEAST_ODDS)
+    ]  # fmt: skip
 
 
 def compared_pairs(rank: Float64[ndarray, "n n"], most: int) -> list[Pair]:

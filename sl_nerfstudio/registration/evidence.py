@@ -1,0 +1,606 @@
+"""Evidence for the place of two frames against each other: the likelihood of what one decoded, given the other's surface.
+
+Each frame is a lattice of distances along the rays of its camera, at the resolution at which it was decoded. A point of
+one frame that falls on a place of the other has a residual: how far it lies behind the surface there, along the other's
+ray, in standard deviations of both. Its density is a mixture with tails, because some coordinates are simply wrong.
+
+A point counts by how much its residual says about the place (as the information in features against that in smooth
+surface): a point that fits wherever the frames were tried says nothing, however well it fits. So each frame keeps, of
+each of its points, the share of other places at which it fitted. Neighbouring pixels share their errors, so all pixels
+of a correlation area count as one.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int8, Int64
+from numpy import ndarray
+from scipy.ndimage import uniform_filter
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.parallel import compiled, compiled_range
+from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, HIDDEN_DEPTH, LEAST_LIT_COSINE, Hypotheses
+from sl_nerfstudio.registration.surfaces import (
+    EmptyPlaces,
+    FrameCloud,
+    SurfaceMap,
+    build_surface_map,
+    find_empty_places,
+)
+from sl_nerfstudio.relative_pose.epipolar import directions
+
+LARGEST_SIDE = 640  # places of the lattice along the image's longer side
+POINTS = 2000  # of a frame that are compared, about
+CORRELATION_AREA = 120.0  # places whose errors are one: the decoder looks at windows
+NORMAL_REACH = (2, 4)  # places on each side over which normals are differences: the widest that is known
+BLOCK = 4  # places along each side of a block whose normal and pose errors are one
+RELIEF_REACH = 6  # places on each side over which the relief is measured
+NOISE_FACTOR, RELIEF_FACTOR, LARGEST_RELIEF = 0.75, 1.6, 200.0  # sigma grows with relief: the decoder smooths over it
+LEAST_FACING_COSINE = 0.3  # between a surface and the ray from the other camera
+POSE_ERRORS = 5  # principal errors of a frame's relative pose, which bend its surface
+UNKNOWNS = 7 + 2 * POSE_ERRORS  # a similarity and the errors of both relative poses
+
+# The density of residuals in sigmas: three normal distributions and a uniform one for coordinates that are wrong.
+TAIL_SIGMAS = np.array([1.0, 3.0, 10.0])
+TAIL_WEIGHTS = np.array([0.88, 0.09, 0.02])
+LARGEST_RESIDUAL = 100.0
+NOISE_QUANTILES = np.array([0.68, 0.95])  # of residuals, by which a pair's are compared with that density
+NOISE_RESIDUALS = np.array([1.06, 3.2])  # its quantiles there
+FEWEST_JUDGED = 50  # points by which that is known
+ELSEWHERE_SIGMA = 12.0  # of a point that does not belong there: somewhere near, or anywhere
+
+USUAL_SHARE = 0.9  # of other places at which a point fits, before any was tried: most surface is smooth
+ABSENT_SHARE, LEAST_ABSENT = (
+    1e-3,
+    0.01,
+)  # points that should be seen and are not: in the right place, elsewhere at least
+
+NEAR_THINNED = 3  # only each so-manieth point is used to find the most likely place close to one
+NEAR_WIDTHS = (10.0, 7.0, 5.0, 4.0)  # of the kernel on the way there, sigmas
+NEAR_DEG, NEAR_SHIFT = 2.0, 0.08  # how far that may be: degrees, radii
+
+JUDGED, ABSENT, UNDECODED, HIDDEN = 1, 2, 3, 4  # codes of points that are in view
+
+
+@dataclass(frozen=True)
+class FrameEvidence:
+    """The surface of one frame for comparisons, in camera axes, in units of its baseline."""
+
+    camera: Device  # of the lattice
+    surface: Float32[ndarray, "h w 2"]  # distance along the ray (NaN: none) and its sigma
+    smooth: Float32[ndarray, "a b 8"]  # pose errors of the distance and the normal (NaN: unknown), of blocks of places
+    nothing: EmptyPlaces
+    points: Float64[ndarray, "n 12"]  # position, normal, sigma along the ray, pose errors
+    place: Int64[ndarray, "n"]  # of each point in the lattice
+    centroid: Float64[ndarray, "3"]
+    radius: float
+    area: float  # points that count as one
+
+    @property
+    def hidden(self) -> float:
+        """How far behind the surface a point is hidden by it, and contradicts nothing."""
+        return HIDDEN_DEPTH * self.radius
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A frame as registration sees it: coarse, to search; and as it was decoded, to compare."""
+
+    map: SurfaceMap
+    evidence: FrameEvidence
+
+    @staticmethod
+    def of(cloud: FrameCloud) -> "Frame":
+        """Build both from a cloud."""
+        return Frame(build_surface_map(cloud), frame_evidence(cloud))
+
+
+def frame_evidence(cloud: FrameCloud) -> FrameEvidence:
+    """Put the points of a cloud on the lattice."""
+    factor = min(1.0, LARGEST_SIDE / max(cloud.camera.w, cloud.camera.h))
+    camera = cloud.camera.scaled(factor)
+    h, w = camera.h, camera.w
+    column, row = np.floor(cloud.uv_camera * factor).astype(np.int64).T
+    index = np.minimum(row, h - 1) * w + np.minimum(column, w - 1)
+    count = np.maximum(np.bincount(index, minlength=h * w), 1)
+
+    def mean(values: Float64[ndarray, "n"]) -> Float64[ndarray, "h w"]:
+        return (np.bincount(index, values, h * w) / count).reshape(h, w)
+
+    known = np.bincount(index, minlength=h * w).reshape(h, w) > 0
+    distance = np.where(known, 1 / mean(1 / np.linalg.norm(cloud.points, axis=1)), np.nan)
+    uv = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1).reshape(-1, 2)
+    ray = directions(camera, uv).reshape(h, w, 3)
+    ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+    point = ray * distance[..., None]
+    noise = mean(cloud.sigma_noise)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relief = np.nan_to_num(_relief(distance) / noise, nan=3.0)
+    sigma = noise * NOISE_FACTOR * np.sqrt(1 + RELIEF_FACTOR * np.minimum(relief, LARGEST_RELIEF))
+    errors = np.stack([mean(values) for values in cloud.pose_errors.T], -1)
+    normal = _normals(point)
+    surface = np.stack([distance, sigma], -1).astype(np.float32)
+    usable = known & np.isfinite(normal).all(-1)
+    step = max(1, round(float(np.sqrt(usable.sum() / POINTS))))
+    some = np.zeros_like(usable)
+    some[step // 2 :: step, step // 2 :: step] = True
+    place = np.flatnonzero(usable & some)
+    points = np.concatenate([point, normal, sigma[..., None], errors], -1).reshape(h * w, -1)[place]
+    visible = point[usable] if usable.any() else cloud.points
+    centroid = visible.mean(0)
+    radius = float(np.sqrt(((visible - centroid) ** 2).sum(-1).mean()))
+    return FrameEvidence(
+        camera, np.ascontiguousarray(surface), _in_blocks(errors, normal, known), find_empty_places(cloud, camera),
+        np.ascontiguousarray(points), place,
+        centroid, radius, max(CORRELATION_AREA / step**2, 1.0),
+    )  # fmt: skip
+
+
+def _in_blocks(
+    errors: Float64[ndarray, "h w 5"], normal: Float64[ndarray, "h w 3"], known: Bool[ndarray, "h w"]
+) -> Float32[ndarray, "a b 8"]:
+    """Means over BLOCK x BLOCK places: what changes slowly need not be kept for each."""
+    h, w = known.shape
+    shape = -(-h // BLOCK), -(-w // BLOCK)
+    row, column = np.nonzero(known)
+    index = row // BLOCK * shape[1] + column // BLOCK
+    values = np.concatenate([errors[known], np.nan_to_num(normal[known])], 1)
+    count = np.maximum(np.bincount(index, minlength=shape[0] * shape[1]), 1)[:, None]
+    sums = np.stack([np.bincount(index, v, shape[0] * shape[1]) for v in values.T], -1) / count
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sums[:, POSE_ERRORS:] /= np.linalg.norm(sums[:, POSE_ERRORS:], axis=1, keepdims=True)
+    return np.ascontiguousarray(sums.reshape(*shape, 8).astype(np.float32))
+
+
+def _normals(point: Float64[ndarray, "h w 3"]) -> Float64[ndarray, "h w 3"]:
+    """Unit normals towards the camera from differences of points; NaN where unknown."""
+    normal = np.full(point.shape, np.nan)
+    for m in NORMAL_REACH:
+        across, down = np.full(point.shape, np.nan), np.full(point.shape, np.nan)
+        across[:, m:-m] = point[:, 2 * m :] - point[:, : -2 * m]
+        down[m:-m] = point[2 * m :] - point[: -2 * m]
+        n = np.cross(down, across)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            n /= np.linalg.norm(n, axis=-1, keepdims=True)
+        n *= -np.sign((n * point).sum(-1, keepdims=True))
+        normal = np.where(np.isfinite(n).all(-1, keepdims=True), n, normal)
+    return normal
+
+
+def _relief(distance: Float64[ndarray, "h w"]) -> Float64[ndarray, "h w"]:
+    """Root mean square departure of the distances around each place from a plane (of inverse distances)."""
+    known = np.isfinite(distance)
+    weight, size = known.astype(np.float64), 2 * RELIEF_REACH + 1
+    q = np.where(known, 1 / np.where(known, distance, 1.0), 0.0)
+    y, x = np.mgrid[0 : q.shape[0], 0 : q.shape[1]].astype(np.float64)
+
+    def mean(values: Float64[ndarray, "h w"]) -> Float64[ndarray, "h w"]:
+        return uniform_filter(values, size, mode="constant")
+
+    total = mean(weight) + 1e-12
+    mx, my, mq = mean(weight * x) / total, mean(weight * y) / total, mean(q) / total
+    cxx, cyy = mean(weight * x * x) / total - mx * mx, mean(weight * y * y) / total - my * my
+    cxy = mean(weight * x * y) / total - mx * my
+    cxq, cyq = mean(q * x) / total - mx * mq, mean(q * y) / total - my * mq
+    cqq = mean(q * q) / total - mq * mq
+    determinant = np.maximum(cxx * cyy - cxy**2, 1e-9)
+    a, b = (cxq * cyy - cyq * cxy) / determinant, (cyq * cxx - cxq * cxy) / determinant
+    return np.sqrt(np.maximum(cqq - a * cxq - b * cyq, 0)) * distance**2
+
+
+# The compiled loop.
+
+
+@compiled_range
+def _residuals(
+    first, last, points, scale, R, t, reverse, own, other, surface, smooth, block, code, camera, empty, light, hidden, least_facing,
+    least_lit, centre, widths, z, codes, H, g
+):  # fmt: skip
+    """Residual and code of every point under every similarity; adds weighted normal equations where `widths` > 0.
+
+    `own`, `other`: pose errors of the points' frame and of the one they fall on, (k, 5). `reverse`: points are the
+    target's, `surface` is the source's.
+    """
+    h, w = surface.shape[0], surface.shape[1]
+    n = points.shape[0]
+    M, shift, J = np.empty((3, 3)), np.empty(3), np.empty(17)
+    for k in range(first, last):
+        s = scale[k]
+        for i in range(3):
+            for j in range(3):
+                M[i, j] = R[k, j, i] if reverse else R[k, i, j]
+        for i in range(3):
+            shift[i] = -(M[i, 0] * t[k, 0] + M[i, 1] * t[k, 1] + M[i, 2] * t[k, 2]) / s if reverse else t[k, i]
+        f = 1 / s if reverse else s
+        width = widths[k]
+        for m in range(n):
+            codes[k, m] = 0
+            z[k, m] = 0.0
+            px, py, pz = points[m, 0], points[m, 1], points[m, 2]
+            length = np.sqrt(px * px + py * py + pz * pz)
+            off = 0.0
+            for e in range(5):
+                off += points[m, 7 + e] * own[k, e]
+            grown = 1 + off / length
+            px, py, pz = px * grown, py * grown, pz * grown
+            X = f * (M[0, 0] * px + M[0, 1] * py + M[0, 2] * pz) + shift[0]
+            Y = f * (M[1, 0] * px + M[1, 1] * py + M[1, 2] * pz) + shift[1]
+            Z = f * (M[2, 0] * px + M[2, 1] * py + M[2, 2] * pz) + shift[2]
+            column, row, front = pixel_of(code, X, Y, Z, camera)
+            u, v = column - 0.5, row - 0.5
+            if not (front and u >= 0 and v >= 0 and u < w - 1 and v < h - 1):
+                continue
+            a, b, c = points[m, 3], points[m, 4], points[m, 5]
+            A = M[0, 0] * a + M[0, 1] * b + M[0, 2] * c
+            B = M[1, 0] * a + M[1, 1] * b + M[1, 2] * c
+            C = M[2, 0] * a + M[2, 1] * b + M[2, 2] * c
+            d = np.sqrt(X * X + Y * Y + Z * Z)
+            if least_facing * d > -(A * X + B * Y + C * Z):
+                continue
+            iu, iv = int(u), int(v)
+            fu, fv = u - iu, v - iv
+            d00, d01 = float(surface[iv, iu, 0]), float(surface[iv, iu + 1, 0])
+            d10, d11 = float(surface[iv + 1, iu, 0]), float(surface[iv + 1, iu + 1, 0])
+            nu, nv = int(u + 0.5), int(v + 0.5)
+            seen = (d00 * (1 - fu) + d01 * fu) * (1 - fv) + (d10 * (1 - fu) + d11 * fu) * fv
+            if not np.isfinite(seen):
+                codes[k, m] = 3
+                if empty[nv, nu] and _lit(X, Y, Z, A, B, C, light, least_lit):
+                    codes[k, m] = 2
+                continue
+            br, bc = nv // block, nu // block
+            off = 0.0
+            for e in range(5):
+                off += smooth[br, bc, e] * other[k, e]
+            rho = d - seen - off
+            if rho > hidden:
+                codes[k, m] = 4
+                continue
+            na, nb, nc = float(smooth[br, bc, 5]), float(smooth[br, bc, 6]), float(smooth[br, bc, 7])
+            cosine = -(na * X + nb * Y + nc * Z) / d
+            if not cosine > 0.1:  # too oblique, or its normal is unknown
+                na, nb, nc = A, B, C
+                cosine = -(A * X + B * Y + C * Z) / d
+            # the residual's derivative by the mapped point: along the normal, over its cosine with the ray
+            ga, gb, gc = -na / cosine, -nb / cosine, -nc / cosine
+            ea = (
+                (
+                    ga * (M[0, 0] * px + M[0, 1] * py + M[0, 2] * pz)
+                    + gb * (M[1, 0] * px + M[1, 1] * py + M[1, 2] * pz)
+                    + gc * (M[2, 0] * px + M[2, 1] * py + M[2, 2] * pz)
+                )
+                * f
+                / (length * grown)
+            )  # by a motion along the point's own ray
+            twist = 0.5 * (d00 + d11 - d01 - d10)
+            sigma = np.sqrt(float(surface[nv, nu, 1]) ** 2 + (ea * points[m, 6]) ** 2 + twist * twist)
+            codes[k, m] = 1
+            r = rho / sigma
+            z[k, m] = r
+            if width <= 0 or abs(r) > 4 * width:
+                continue
+            x = r / width
+            weight = 1 / (1 + x * x) ** 2
+            if reverse:  # the point stays, the increment moves the other frame below it
+                Ga = -(M[0, 0] * ga + M[1, 0] * gb + M[2, 0] * gc) / s
+                Gb = -(M[0, 1] * ga + M[1, 1] * gb + M[2, 1] * gc) / s
+                Gc = -(M[0, 2] * ga + M[1, 2] * gb + M[2, 2] * gc) / s
+                qx, qy, qz = px - centre[0], py - centre[1], pz - centre[2]
+            else:
+                Ga, Gb, Gc = ga, gb, gc
+                qx, qy, qz = X - centre[0], Y - centre[1], Z - centre[2]
+            J[0], J[1], J[2] = Ga / sigma, Gb / sigma, Gc / sigma
+            J[3] = (qy * Gc - qz * Gb) / sigma
+            J[4] = (qz * Ga - qx * Gc) / sigma
+            J[5] = (qx * Gb - qy * Ga) / sigma
+            J[6] = (qx * Ga + qy * Gb + qz * Gc) / sigma
+            for e in range(5):
+                moved, below = ea * points[m, 7 + e] / sigma, -smooth[br, bc, e] / sigma
+                J[7 + e] = below if reverse else moved
+                J[12 + e] = moved if reverse else below
+            for i in range(17):
+                scaled = weight * J[i]
+                g[k, i] += scaled * r
+                for j in range(i + 1):
+                    H[k, i, j] += scaled * J[j]
+
+
+@compiled
+def _lit(X, Y, Z, A, B, C, light, least_cosine):
+    """Whether a place would be seen and lit: `light` see EmptyPlaces."""
+    code, projector, T, reach = light
+    if least_cosine * np.sqrt(X * X + Y * Y + Z * Z) > -(A * X + B * Y + C * Z):
+        return False
+    x = T[0, 0] * X + T[0, 1] * Y + T[0, 2] * Z + T[0, 3]
+    y = T[1, 0] * X + T[1, 1] * Y + T[1, 2] * Z + T[1, 3]
+    z = T[2, 0] * X + T[2, 1] * Y + T[2, 2] * Z + T[2, 3]
+    a = T[0, 0] * A + T[0, 1] * B + T[0, 2] * C
+    b = T[1, 0] * A + T[1, 1] * B + T[1, 2] * C
+    c = T[2, 0] * A + T[2, 1] * B + T[2, 2] * C
+    distance = np.sqrt(x * x + y * y + z * z)
+    if -(a * x + b * y + c * z) < least_cosine * distance:
+        return False
+    column, row, front = pixel_of(code, x, y, z, projector)
+    if not (front and column >= 0 and row >= 0 and column < reach.shape[1] and row < reach.shape[0]):
+        return False
+    return distance < reach[int(row), int(column)]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Similarities `p_target = scale R p_source + t` with the errors of both relative poses, in their sigmas."""
+
+    scale: Float64[ndarray, "k"]
+    R: Float64[ndarray, "k 3 3"]
+    t: Float64[ndarray, "k 3"]
+    errors: Float64[ndarray, "k 10"]  # of the source, of the target
+
+    @staticmethod
+    def of(*each: Similarity) -> "Places":
+        """Stack similarities; no errors."""
+        return Places(
+            np.array([S.scale for S in each]), np.stack([S.R for S in each]), np.stack([S.t for S in each]),
+            np.zeros((len(each), 2 * POSE_ERRORS)),
+        )  # fmt: skip
+
+    @staticmethod
+    def of_hypotheses(found: Hypotheses) -> "Places":
+        """The ends of a search; no errors."""
+        return Places(found.scale, found.R, found.t, np.zeros((len(found), 2 * POSE_ERRORS)))
+
+    @staticmethod
+    def joined(parts: Sequence["Places"]) -> "Places":
+        """Several sets as one."""
+        return Places(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("scale", "R", "t", "errors")))
+
+    def __len__(self) -> int:
+        return len(self.scale)
+
+    def __getitem__(self, index: Sequence[int] | slice | ndarray) -> "Places":
+        return Places(self.scale[index], self.R[index], self.t[index], self.errors[index])
+
+    def similarity(self, k: int) -> Similarity:
+        """One of them."""
+        return Similarity(float(self.scale[k]), self.R[k], self.t[k])
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Residuals (in sigmas) and codes of the points of both frames at k places: source's points first."""
+
+    z: Float32[ndarray, "k n"]
+    codes: Int8[ndarray, "k n"]
+
+    def chosen(self, index: Int64[ndarray, "m"]) -> "Compared":
+        """Some of the places."""
+        return Compared(self.z[index], self.codes[index])
+
+    def noise(self, k: int, points: slice) -> float:
+        """How much larger the residuals of some points are at a place than stated; at least 1."""
+        size = np.abs(self.z[k, points][self.codes[k, points] == JUDGED])
+        if len(size) < FEWEST_JUDGED:
+            return 1.0
+        return float(max(1.0, *np.quantile(size, NOISE_QUANTILES) / NOISE_RESIDUALS))
+
+    def scaled(self, noise: Float64[ndarray, "n"]) -> "Compared":
+        """Residuals in units of what they are found to be."""
+        return Compared(self.z / noise.astype(np.float32), self.codes)
+
+    def overlaps(self, other: "Compared", share: float) -> bool:
+        """Whether the first place lets at least a share of the points be judged that the other's does."""
+        return (self.codes[0] == JUDGED).sum() >= share * (other.codes[0] == JUDGED).sum()
+
+
+def density(z: Float32[ndarray, "*n"]) -> Float32[ndarray, "*n"]:
+    """Of residuals (in sigmas) of points that lie on the other frame's surface."""
+    size = np.minimum(np.abs(z), np.float32(LARGEST_RESIDUAL))
+    found = np.full(z.shape, (1 - TAIL_WEIGHTS.sum()) / (2 * LARGEST_RESIDUAL), np.float32)
+    for weight, sigma in zip(TAIL_WEIGHTS.tolist(), TAIL_SIGMAS.tolist(), strict=True):
+        found += np.float32(weight / sigma / np.sqrt(2 * np.pi)) * np.exp(np.float32(-0.5 / sigma**2) * size * size)
+    return found
+
+
+def density_elsewhere(z: Float32[ndarray, "*n"]) -> Float32[ndarray, "*n"]:
+    """Of residuals of points that are somewhere else: near the surface, or anywhere."""
+    size = np.minimum(np.abs(z), np.float32(LARGEST_RESIDUAL))
+    near = np.float32(0.5 / ELSEWHERE_SIGMA / np.sqrt(2 * np.pi))
+    return np.float32(0.25 / LARGEST_RESIDUAL) + near * np.exp(np.float32(-0.5 / ELSEWHERE_SIGMA**2) * size * size)
+
+
+@dataclass(frozen=True)
+class Commonness:
+    """How often points were tried where they do not belong, and how often they fitted there."""
+
+    fits: Float64[ndarray, "n"]
+    trials: Float64[ndarray, "n"]
+    absent: float  # points that should have been seen, and were not
+    judged: float  # the same and those that could be judged
+
+    @staticmethod
+    def none(count: int) -> "Commonness":
+        """Before anything was tried."""
+        return Commonness(np.zeros(count), np.zeros(count), 0.0, 0.0)
+
+    def __add__(self, other: "Commonness") -> "Commonness":
+        return Commonness(
+            self.fits + other.fits, self.trials + other.trials, self.absent + other.absent, self.judged + other.judged
+        )
+
+    @property
+    def share(self) -> Float64[ndarray, "n"]:
+        """The share at which each point fits anywhere."""
+        return (self.fits + USUAL_SHARE) / (self.trials + 1)
+
+    @property
+    def absent_share(self) -> float:
+        """The share of points that should be seen and are not, elsewhere."""
+        return float(np.clip(self.absent / max(self.judged, 1.0), LEAST_ABSENT, 0.5))
+
+
+class PairEvidence:
+    """Two frames that are compared."""
+
+    def __init__(self, source: FrameEvidence, target: FrameEvidence, thin: int = 1) -> None:
+        self.source, self.target = source, target
+        self._points = tuple(np.ascontiguousarray(f.points[::thin]) for f in (source, target))
+        self.area = np.concatenate(
+            [np.full(len(p), max(f.area / thin, 1.0)) for p, f in zip(self._points, (source, target), strict=True)]
+        )
+        self._mean_area = float(self.area.mean())
+
+    def compare(self, places: Places) -> Compared:
+        """Residuals of all points at all places."""
+        return self._compare(places, np.zeros(len(places)))[0]
+
+    def _compare(self, places: Places, width: Float64[ndarray, "k"]) -> tuple[Compared, ndarray, ndarray]:
+        """Residuals, and normal equations with robust kernels of the given widths (sigmas) above 0."""
+        k = len(places)
+        H, g = np.zeros((k, UNKNOWNS, UNKNOWNS)), np.zeros((k, UNKNOWNS))
+        zs, codes = [], []
+        R, t = np.ascontiguousarray(places.R), np.ascontiguousarray(places.t)
+        own = np.ascontiguousarray(places.errors[:, :POSE_ERRORS]), np.ascontiguousarray(places.errors[:, POSE_ERRORS:])
+        for reverse, (points, seen) in enumerate(((self._points[0], self.target), (self._points[1], self.source))):
+            z, code = np.empty((k, len(points)), np.float32), np.empty((k, len(points)), np.int8)
+            model, parameters = for_loops(seen.camera)
+            _residuals(
+                k, points, places.scale, R, t, bool(reverse), own[reverse], own[1 - reverse], seen.surface,
+                seen.smooth, BLOCK, model, parameters, seen.nothing.empty, seen.nothing.light, seen.hidden, LEAST_FACING_COSINE,
+                LEAST_LIT_COSINE, self.target.centroid, width, z, code, H, g,
+            )  # fmt: skip
+            zs.append(z)
+            codes.append(code)
+        i, j = np.tril_indices(UNKNOWNS, -1)
+        H[:, j, i] = H[:, i, j]
+        return Compared(np.concatenate(zs, 1), np.concatenate(codes, 1)), H / self._mean_area, g / self._mean_area
+
+    def refined(
+        self, places: Places, widths: Sequence[float], axis: Float64[ndarray, "k 3"] | None = None
+    ) -> tuple[Places, Float64[ndarray, "k 17 17"]]:
+        """Gauss-Newton steps with a narrowing kernel, and the last information; lengths in radii of the target.
+
+        `axis`: directions about which no rotation is allowed.
+        """
+        c, radius = self.target.centroid, self.target.radius
+        D = np.ones(UNKNOWNS)
+        D[:3] = radius
+        prior = np.zeros(UNKNOWNS)
+        prior[7:] = 1.0
+        prior[6] = 1 / 0.25**2
+        diagonal = np.arange(UNKNOWNS)
+        H = np.zeros((len(places), UNKNOWNS, UNKNOWNS))
+        for width in widths:
+            _, H, g = self._compare(places, np.full(len(places), width))
+            H, g = H * D[:, None] * D, g * D
+            H[:, diagonal, diagonal] += prior
+            g[:, 7:] += places.errors
+            A = H.copy()
+            trace = np.trace(H[:, :7, :7], axis1=1, axis2=2)
+            A[:, diagonal[:7], diagonal[:7]] += 1e-6 * trace[:, None]
+            if axis is not None:
+                P = np.tile(np.eye(UNKNOWNS), (len(places), 1, 1))
+                held = axis[:, :, None] * axis[:, None, :]
+                P[:, 3:6, 3:6] -= held
+                A, g = P @ A @ P, (P @ g[..., None])[..., 0]
+                A[:, 3:6, 3:6] += held * trace[:, None, None]
+            step = -np.linalg.solve(A, g[..., None])[..., 0]
+            step[:, :7] /= np.maximum(np.linalg.norm(step[:, :7], axis=1, keepdims=True) / 0.3, 1)
+            E = Rotation.from_rotvec(step[:, 3:6]).as_matrix()
+            growth = np.exp(step[:, 6])
+            t = c + growth[:, None] * np.einsum("kij,kj->ki", E, places.t - c) + step[:, :3] * radius
+            places = Places(places.scale * growth, E @ places.R, t, places.errors + step[:, 7:])
+        return places, H
+
+    def commonness(self, found: Compared) -> tuple[Commonness, Commonness]:
+        """What places say, at all of which the frames do not belong, about the points of each frame."""
+        p, other = density(found.z), density_elsewhere(found.z)
+        judged, absent = found.codes == JUDGED, found.codes == ABSENT
+        fits = np.where(judged, USUAL_SHARE * p / (USUAL_SHARE * p + (1 - USUAL_SHARE) * other), 0)
+        n = len(self._points[0])
+        parts = [
+            Commonness(fits[:, s].sum(0).astype(np.float64), judged[:, s].sum(0).astype(np.float64),
+                       float(absent[:, s].sum()), float((judged | absent)[:, s].sum()))
+            for s in (slice(None, n), slice(n, None))
+        ]  # fmt: skip
+        return parts[0], parts[1]
+
+    def log_odds(self, found: Compared, common: tuple[Commonness, Commonness]) -> Float64[ndarray, "k"]:
+        """Log-likelihood of each place, against that of the same points elsewhere, in nats."""
+        share = np.concatenate([c.share for c in common]).astype(np.float32)
+        gone = np.concatenate([np.full(len(c.fits), c.absent_share) for c in common])
+        p, other = density(found.z), density_elsewhere(found.z)
+        seen = np.log(p / (share * p + (1 - share) * other)) + np.log((1 - ABSENT_SHARE) / (1 - gone))
+        return (
+            np.where(found.codes == JUDGED, seen, 0) / self.area
+            + np.where(found.codes == ABSENT, np.log(ABSENT_SHARE / gone), 0) / self.area
+        ).sum(1)
+
+    def noise(self, found: Compared, k: int) -> tuple[float, float]:
+        """How much larger residuals are at a place than stated: of the source's points, of the target's."""
+        n = len(self._points[0])
+        return found.noise(k, slice(None, n)), found.noise(k, slice(n, None))
+
+    def scaled(self, found: Compared, noise: tuple[float, float]) -> Compared:
+        """Residuals in units of what they are found to be."""
+        each = [np.full(len(points), size) for points, size in zip(self._points, noise, strict=True)]
+        return found.scaled(np.concatenate(each))
+
+    def log_odds_among_themselves(self, places: Places) -> Float64[ndarray, "k"]:
+        """Log-odds of places by what they say of each other."""
+        found = self.compare(places)
+        return self.log_odds(found, self.commonness(found))
+
+    def lead(self, first: Compared, other: Compared) -> float:
+        """By how many nats the first place of one is more likely than that of another, on points that both judge."""
+        a, b = first.codes[0], other.codes[0]
+        both = (a == JUDGED) & (b == JUDGED)
+        ratio = np.where(both, np.log(density(first.z[0])) - np.log(density(other.z[0])), 0)
+        gone = np.log(ABSENT_SHARE) * (((a == ABSENT) & (b == JUDGED)) * 1.0 - ((b == ABSENT) & (a == JUDGED)))
+        return float(((ratio + gone) / self.area).sum())
+
+
+class ScanEvidence:
+    """Any two frames of a scan compared at any place, by what its pairs have shown of each frame's points."""
+
+    def __init__(
+        self, frames: Sequence[FrameEvidence], common: Sequence[Commonness], noise: Float64[ndarray, "n"]
+    ) -> None:
+        self.frames, self.common, self.noise = frames, common, noise
+
+    def log_odds(self, source: int, target: int, places: Sequence[Similarity]) -> Float64[ndarray, "k"]:
+        """Log-odds, in nats, of the most likely place close to each: components of frames drift by a little."""
+        found = self._near(source, target, places)
+        if found is None:
+            return np.zeros(len(places))
+        return found[0].log_odds(found[1], (self.common[source], self.common[target]))
+
+    def agreement(self, source: int, target: int, place: Similarity) -> tuple[float, float, float]:
+        """Log-odds of a place; points of both frames that agree there, and that should, in frames: 1 is all of one."""
+        found = self._near(source, target, [place])
+        if found is None:
+            return 0.0, 0.0, 0.0
+        evidence, compared = found
+        codes, z = compared.codes[0], np.abs(compared.z[0])
+        judged = codes == JUDGED
+        odds = evidence.log_odds(compared, (self.common[source], self.common[target]))
+        agreeing, expected = (judged & (z < AGREEING_SIGMAS)).mean(), (judged | (codes == ABSENT)).mean()
+        return float(odds[0]), float(agreeing), float(expected)
+
+    def _near(self, source: int, target: int, places: Sequence[Similarity]) -> tuple[PairEvidence, Compared] | None:
+        """Residuals at the most likely place close to each; None if a frame has no points."""
+        a, b = self.frames[source], self.frames[target]
+        if not (len(a.points) and len(b.points)):
+            return None
+        start = Places.of(*places)
+        few, every = PairEvidence(a, b, NEAR_THINNED), PairEvidence(a, b)
+        near, _ = few.refined(start, NEAR_WIDTHS)
+        turned = np.degrees(np.arccos(np.clip((np.einsum("kij,kij->k", near.R, start.R) - 1) / 2, -1, 1)))
+        p = np.einsum("kji,kj->ki", start.R, b.centroid - start.t) / start.scale[:, None]
+        shift = near.scale[:, None] * np.einsum("kij,kj->ki", near.R, p) + near.t - b.centroid
+        left = (turned > NEAR_DEG) | (np.linalg.norm(shift, axis=1) > NEAR_SHIFT * b.radius)
+        both = Places.joined([start, near])
+        chosen = both[np.where(left, 0, len(start)) + np.arange(len(start))]
+        noise = float(self.noise[source]), float(self.noise[target])
+        return every, every.scaled(every.compare(chosen), noise)
