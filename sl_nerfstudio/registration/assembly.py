@@ -208,20 +208,6 @@ class Link:
     edge: PairMatch
 
 
-@dataclass(frozen=True)
-class Joint:
-    """Two components under one similarity: log-odds summed over pairs of frames across them, in nats."""
-
-    S_first_second: Similarity
-    seen: float  # by what the frames decoded
-    usual: float  # by the order of capture
-
-    @property
-    def log_odds(self) -> float:
-        """Both together."""
-        return self.seen + self.usual
-
-
 Prior = Callable[[int, int, Similarity], float]
 
 
@@ -266,12 +252,12 @@ class Assembly:
             if a == b or (key := (min(a, b), max(a, b))) in self._rejected:
                 continue
             first, second = self._component_of(edge.target), self._component_of(edge.source)
-            joint = self.decide(first, second)
-            if joint is None:
+            S = self.decide(first, second)
+            if S is None:
                 self._rejected.add(key)
                 continue
             self.components = [c for c in self.components if c is not first and c is not second]
-            self.components.append(self._joined(first, second, joint.S_first_second))
+            self.components.append(self._joined(first, second, S))
             self._joins += 1
             for k in self.components[-1]:
                 self._number[k] = len(self._pivots) - 1 + self._joins
@@ -287,30 +273,54 @@ class Assembly:
         found = optimise_pose_graph(self._edges, self._pivots, both, self._weight).S_world_camera
         return {k: found[k] for k in both}
 
-    def decide(self, first: Component, second: Component) -> Joint | None:
+    def decide(self, first: Component, second: Component) -> Similarity | None:
         """The similarity between two components; None where it is not certain."""
-        joints = sorted(self._joints(first, second), key=lambda joint: -joint.log_odds)
-        if not joints or joints[0].log_odds < LEAST_ODDS:
+        places = self._proposed(first, second)
+        if not places:
             return None
-        best = joints[0]
-        apart = [j for j in joints[1:] if self.differ(j.S_first_second, best.S_first_second, second)]
-        if any(j.log_odds > best.log_odds - LEAST_ODDS for j in apart):
-            if not self._slipping:
-                return None
-        elif any(j.seen > best.seen - LEAST_ODDS for j in apart):
-            self.by_order = True
-        return best
+        leads, odds = self.compare(first, second, places)
+        usual = np.array([self._usual(first, second, S) for S in places])
+        both = leads + usual[:, None] - usual
+        best = int(np.argmax(both.min(1)))
+        if odds[best] < LEAST_ODDS:
+            return None
+        others = [k for k in range(len(places)) if k != best]
+        if others and both[best, others].min() < LEAST_ODDS and not self._slipping:
+            return None
+        self.by_order |= bool(others) and bool(leads[best, others].min() < LEAST_ODDS)
+        return places[best]
 
-    def _joints(self, first: Component, second: Component) -> list[Joint]:
-        """The clearly different similarities between two components that pairs across say."""
+    def _proposed(self, first: Component, second: Component) -> list[Similarity]:
+        """The clearly different similarities between two components that pairs across say, the most likely first."""
         links = [link for e in self._between(first, second) for link in self._links(e, first, second)]
-        distinct: list[Link] = []
+        distinct: list[Similarity] = []
         for link in sorted(links, key=lambda one: -one.log_odds):
             if len(distinct) == MOST_COMPARED:
                 break
-            if all(self.differ(link.S_first_second, other.S_first_second, second) for other in distinct):
-                distinct.append(link)
-        return [self.judge(first, second, one.S_first_second) for one in distinct]
+            if all(self.differ(link.S_first_second, other, second) for other in distinct):
+                distinct.append(link.S_first_second)
+        return distinct
+
+    def compare(
+        self, first: Component, second: Component, places: Sequence[Similarity]
+    ) -> tuple[Float64[ndarray, "k k"], Float64[ndarray, "k"]]:
+        """By how many nats each place leads each other, and anywhere else: sums over all frames that face each other."""
+        leads, odds = np.zeros((len(places), len(places))), np.zeros(len(places))
+        near = [set(facing(first, second, S)) for S in places]
+        for i, j in sorted(set().union(*near)):
+            here = [
+                first[i].inverse() @ S @ second[j] if (i, j) in pairs else None
+                for S, pairs in zip(places, near, strict=True)
+            ]
+            each = self._scan.comparison(j, i, here)
+            leads, odds = leads + each[0], odds + each[1]
+        return leads, odds
+
+    def _usual(self, first: Component, second: Component, S: Similarity) -> float:
+        """Log-odds of a place by the order of capture."""
+        if self._prior is None:
+            return 0.0
+        return sum(self._prior(i, j, first[i].inverse() @ S @ second[j]) for i in first for j in second)
 
     def _between(self, first: Component, second: Component) -> list[PairMatch]:
         return [
@@ -330,16 +340,6 @@ class Assembly:
             Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), odds, e)
             for S, odds in places
         ]
-
-    def judge(self, first: Component, second: Component, S: Similarity) -> Joint:
-        """All frames across that face each other at a place."""
-        seen = usual = 0.0
-        for i, j in facing(first, second, S):
-            S_i_j = first[i].inverse() @ S @ second[j]
-            seen += float(self._scan.log_odds(j, i, [S_i_j])[0])
-        if self._prior is not None:
-            usual = sum(self._prior(i, j, first[i].inverse() @ S @ second[j]) for i in first for j in second)
-        return Joint(S, seen, usual)
 
     def differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
         """Whether two similarities put the frames of `second` at clearly different places."""

@@ -49,6 +49,7 @@ TAIL_WEIGHTS = np.array([0.88, 0.09, 0.02])
 LARGEST_RESIDUAL = 100.0
 NOISE_QUANTILES = np.array([0.68, 0.95])  # of residuals, by which a pair's are compared with that density
 NOISE_RESIDUALS = np.array([1.06, 3.2])  # its quantiles there
+USUAL_RESIDUAL = 0.7  # in the right place, in sigmas
 FEWEST_JUDGED = 50  # points by which that is known
 ELSEWHERE_SIGMA = 12.0  # of a point that does not belong there: somewhere near, or anywhere
 
@@ -57,6 +58,10 @@ ABSENT_SHARE, LEAST_ABSENT = (
     1e-3,
     0.01,
 )  # points that should be seen and are not: in the right place, elsewhere at least
+
+LEAST_SEEN = 0.3  # points that a place must let be judged, relative to the place that lets most
+LEAST_AGREEING = 0.7  # of those that it lets be judged, for a place to be such a measure
+LARGEST_LEAD = 1e6  # nats: of the only place
 
 NEAR_THINNED = 3  # only each so-manieth point is used to find the most likely place close to one
 NEAR_WIDTHS = (10.0, 7.0, 5.0, 4.0)  # of the kernel on the way there, sigmas
@@ -528,14 +533,30 @@ class PairEvidence:
 
     def log_odds(self, found: Compared, common: tuple[Commonness, Commonness]) -> Float64[ndarray, "k"]:
         """Log-likelihood of each place, against that of the same points elsewhere, in nats."""
+        return (self._against_elsewhere(found, common) / self.area).sum(1)
+
+    def _against_elsewhere(self, found: Compared, common: tuple[Commonness, Commonness]) -> Float64[ndarray, "k n"]:
         share = np.concatenate([c.share for c in common]).astype(np.float32)
         gone = np.concatenate([np.full(len(c.fits), c.absent_share) for c in common])
         p, other = density(found.z), density_elsewhere(found.z)
         seen = np.log(p / (share * p + (1 - share) * other)) + np.log((1 - ABSENT_SHARE) / (1 - gone))
-        return (
-            np.where(found.codes == JUDGED, seen, 0) / self.area
-            + np.where(found.codes == ABSENT, np.log(ABSENT_SHARE / gone), 0) / self.area
-        ).sum(1)
+        absent = np.log(ABSENT_SHARE / gone)
+        return np.where(found.codes == JUDGED, seen, np.where(found.codes == ABSENT, absent, 0))
+
+    def comparison(self, found: Compared, common: tuple[Commonness, Commonness]) -> Float64[ndarray, "k k"]:
+        """By how many nats each place (row) is more likely than each other (column).
+
+        Points that both places judge are compared with themselves: how much of a surface is seen says nothing. What
+        only one of them judges counts as against elsewhere.
+        """
+        known = (found.codes == JUDGED) | (found.codes == ABSENT)
+        usual = float(np.log(density(np.array([USUAL_RESIDUAL], np.float32)))[0])
+        each = np.where(found.codes == ABSENT, np.log(ABSENT_SHARE) + usual, np.log(density(found.z)))
+        J = known.astype(np.float32)
+        alone = (self._against_elsewhere(found, common) / self.area).astype(np.float32)
+        L = np.where(known, each / self.area, 0).astype(np.float32)
+        ahead = L @ J.T + alone @ (1 - J).T
+        return (ahead - ahead.T).astype(np.float64)
 
     def noise(self, found: Compared, k: int) -> tuple[float, float]:
         """How much larger residuals are at a place than stated: of the source's points, of the target's."""
@@ -547,10 +568,15 @@ class PairEvidence:
         each = [np.full(len(points), size) for points, size in zip(self._points, noise, strict=True)]
         return found.scaled(np.concatenate(each))
 
-    def log_odds_among_themselves(self, places: Places) -> Float64[ndarray, "k"]:
-        """Log-odds of places by what they say of each other."""
-        found = self.compare(places)
-        return self.log_odds(found, self.commonness(found))
+    def by_likelihood(self, found: Compared) -> Float64[ndarray, "k"]:
+        """By how many nats each place leads the others, at worst; of places that see enough of each other's surface."""
+        worst = self.comparison(found, self.commonness(found))
+        np.fill_diagonal(worst, np.inf)
+        judged = (found.codes == JUDGED).sum(1)
+        agreeing = ((found.codes == JUDGED) & (np.abs(found.z) < AGREEING_SIGMAS)).sum(1)
+        enough = judged >= LEAST_SEEN * np.max(judged * (agreeing >= LEAST_AGREEING * judged))
+        worst = np.where(enough, worst, np.inf)
+        return np.where(enough, worst.min(1, initial=np.float64(LARGEST_LEAD)), -LARGEST_LEAD)
 
     def lead(self, first: Compared, other: Compared) -> float:
         """By how many nats the first place of one is more likely than that of another, on points that both judge."""
@@ -569,12 +595,21 @@ class ScanEvidence:
     ) -> None:
         self.frames, self.common, self.noise = frames, common, noise
 
-    def log_odds(self, source: int, target: int, places: Sequence[Similarity]) -> Float64[ndarray, "k"]:
-        """Log-odds, in nats, of the most likely place close to each: components of frames drift by a little."""
-        found = self._near(source, target, places)
+    def comparison(
+        self, source: int, target: int, places: Sequence[Similarity | None]
+    ) -> tuple[Float64[ndarray, "k k"], Float64[ndarray, "k"]]:
+        """By how many nats each place leads each other, and elsewhere; None: there the frames do not face each other."""
+        total, alone = np.zeros((len(places), len(places))), np.zeros(len(places))
+        here = [k for k, S in enumerate(places) if S is not None]
+        found = self._near(source, target, [S for S in places if S is not None])
         if found is None:
-            return np.zeros(len(places))
-        return found[0].log_odds(found[1], (self.common[source], self.common[target]))
+            return total, alone
+        evidence, compared = found
+        common = self.common[source], self.common[target]
+        alone[here] = evidence.log_odds(compared, common)
+        total += alone[:, None] - alone
+        total[np.ix_(here, here)] = evidence.comparison(compared, common)
+        return total, alone
 
     def agreement(self, source: int, target: int, place: Similarity) -> tuple[float, float, float]:
         """Log-odds of a place; points of both frames that agree there, and that should, in frames: 1 is all of one."""

@@ -31,6 +31,7 @@ from sl_nerfstudio.registration.agreement import (
 from sl_nerfstudio.registration.evidence import (
     ABSENT,
     JUDGED,
+    LEAST_SEEN,
     Commonness,
     Frame,
     FrameEvidence,
@@ -214,7 +215,7 @@ def register_pair(
     starts = Places.joined([Places.of_hypotheses(found), *([Places.of(*known)] if known else [])])
     few = PairEvidence(source.evidence, target.evidence, THINNED)
     places, H = few.refined(starts, SEARCH_WIDTHS)
-    odds = few.log_odds_among_themselves(places)
+    odds = few.by_likelihood(few.compare(places))
     kept = distinct_places(places, np.argsort(-odds, kind="stable").tolist(), target.evidence)
     way = walk(few, places[kept[:1]], H[kept[0]])
     fine = PairEvidence(source.evidence, target.evidence)
@@ -304,23 +305,22 @@ def best_match(evidence: PairEvidence, starts: Places, pair: tuple[int, int]) ->
     target = evidence.target
     places, H = evidence.refined(starts, FINE_WIDTHS)
     found = evidence.compare(places)
-    odds = evidence.log_odds(found, evidence.commonness(found))
-    best = int(np.argmax(odds))
+    best = int(np.argmax(evidence.by_likelihood(found)))
     if not (found.codes[best] == JUDGED).any():
         return None
     # the peak of a feature is narrow: steps of a walk, or the slope of smooth surface, may miss its top
     near, H_near = evidence.refined(fine_steps(evidence, places[[best]], H[best]), FINE_WIDTHS)
     places, H = Places.joined([places, near]), np.concatenate([H, H_near])
     found = evidence.compare(places)
-    noise = evidence.noise(found, int(np.argmax(evidence.log_odds(found, evidence.commonness(found)))))
+    noise = evidence.noise(found, int(np.argmax(evidence.by_likelihood(found))))
     found = evidence.scaled(found, noise)
-    best = int(np.argmax(evidence.log_odds(found, evidence.commonness(found.chosen(np.arange(len(starts)))))))
-    away = differences(places, places[[best]], target)
-    elsewhere = np.flatnonzero((away[0] > SAME_PLACE_DEG) | (away[1] > SAME_PLACE_SHIFT))
-    common = evidence.commonness(found.chosen(elsewhere))
-    odds = evidence.log_odds(found, evidence.commonness(found.chosen(np.arange(len(starts)))))
-    alone = float(evidence.log_odds(found.chosen(np.array([best])), common)[0])
+    best = int(np.argmax(evidence.by_likelihood(found)))
     turned, shifted = differences(places, places[[best]], target)
+    common = evidence.commonness(found.chosen(np.flatnonzero((turned > SAME_PLACE_DEG) | (shifted > SAME_PLACE_SHIFT))))
+    odds = -evidence.comparison(found, common)[best]
+    alone = float(evidence.log_odds(found.chosen(np.array([best])), common)[0])
+    judged = (found.codes == JUDGED).sum(1)
+    odds = np.where(judged >= LEAST_SEEN * judged[best], odds, -np.inf)
     different: list[int] = []
     for k in np.argsort(-odds, kind="stable").tolist():
         apart = differences(places[[k]], places[[best, *different]], target)

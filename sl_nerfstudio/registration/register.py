@@ -316,7 +316,7 @@ def include_left_out(
     for block in (*_blocks(registration, left_out), *singles):
         joint = None if block.keys() <= placed.keys() else assembly.decide(main, block)
         if joint is not None:
-            placed |= {k: joint.S_first_second @ S for k, S in block.items()}
+            placed |= {k: joint @ S for k, S in block.items()}
     return _with_frames(registration, adjusted, placed)
 
 
