@@ -12,6 +12,7 @@ of a correlation area count as one.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int8, Int64
@@ -34,6 +35,7 @@ from sl_nerfstudio.relative_pose.epipolar import directions
 
 LARGEST_SIDE = 640  # places of the lattice along the image's longer side
 POINTS = 2000  # of a frame that are compared, about
+INDEPENDENT = 300.0  # points of a frame that count as independent at most
 CORRELATION_AREA = 120.0  # places whose errors are one: the decoder looks at windows
 NORMAL_REACH = (2, 4)  # places on each side over which normals are differences: the widest that is known
 BLOCK = 4  # places along each side of a block whose normal and pose errors are one
@@ -45,11 +47,15 @@ UNKNOWNS = 7 + 2 * POSE_ERRORS  # a similarity and the errors of both relative p
 
 # The density of residuals in sigmas: three normal distributions and a uniform one for coordinates that are wrong.
 TAIL_SIGMAS = np.array([1.0, 3.0, 10.0])
-TAIL_WEIGHTS = np.array([0.88, 0.09, 0.02])
+TAIL_SHARES = 0.09, 0.02  # of the second, and of the third where the surface is smooth
+WRONG_SHARE = 0.01  # of coordinates that are wrong, there
+LARGEST_SPREAD = 8.0  # sigma over that of smooth surface, up to which these shares grow with it
 LARGEST_RESIDUAL = 100.0
 NOISE_QUANTILES = np.array([0.68, 0.95])  # of residuals, by which a pair's are compared with that density
 NOISE_RESIDUALS = np.array([1.06, 3.2])  # its quantiles there
-USUAL_RESIDUAL = 0.7  # in the right place, in sigmas
+USUAL_LOG_DENSITY = -1.3  # of a residual in the right place
+SPREADS = np.array([0.8, 1.2, 1.8, 3.0, 6.0])  # sigma relative to the usual one: points are grouped by it
+LARGEST_SHARED = 2.0  # factor by which residuals may be smaller, or larger, for that
 FEWEST_JUDGED = 50  # points by which that is known
 ELSEWHERE_SIGMA = 12.0  # of a point that does not belong there: somewhere near, or anywhere
 
@@ -83,6 +89,7 @@ class FrameEvidence:
     centroid: Float64[ndarray, "3"]
     radius: float
     area: float  # points that count as one
+    usual_sigma: float  # of the distances, on smooth surface
 
     @property
     def hidden(self) -> float:
@@ -116,7 +123,8 @@ def frame_evidence(cloud: FrameCloud) -> FrameEvidence:
         return (np.bincount(index, values, h * w) / count).reshape(h, w)
 
     known = np.bincount(index, minlength=h * w).reshape(h, w) > 0
-    distance = np.where(known, 1 / mean(1 / np.linalg.norm(cloud.points, axis=1)), np.nan)
+    inverse = mean(1 / np.linalg.norm(cloud.points, axis=1))
+    distance = np.where(known, 1 / np.where(known, inverse, 1.0), np.nan)
     uv = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1).reshape(-1, 2)
     ray = directions(camera, uv).reshape(h, w, 3)
     ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -140,7 +148,7 @@ def frame_evidence(cloud: FrameCloud) -> FrameEvidence:
     return FrameEvidence(
         camera, np.ascontiguousarray(surface), _in_blocks(errors, normal, known), find_empty_places(cloud, camera),
         np.ascontiguousarray(points), place,
-        centroid, radius, max(CORRELATION_AREA / step**2, 1.0),
+        centroid, radius, max(CORRELATION_AREA / step**2, len(place) / INDEPENDENT, 1.0), float(np.median(sigma[usable])) if usable.any() else 1.0,
     )  # fmt: skip
 
 
@@ -202,7 +210,7 @@ def _relief(distance: Float64[ndarray, "h w"]) -> Float64[ndarray, "h w"]:
 @compiled_range
 def _residuals(
     first, last, points, scale, R, t, reverse, own, other, surface, smooth, block, code, camera, empty, light, hidden, least_facing,
-    least_lit, centre, widths, z, codes, H, g
+    least_lit, centre, widths, usual, z, codes, spread, H, g
 ):  # fmt: skip
     """Residual and code of every point under every similarity; adds weighted normal equations where `widths` > 0.
 
@@ -224,6 +232,7 @@ def _residuals(
         for m in range(n):
             codes[k, m] = 0
             z[k, m] = 0.0
+            spread[k, m] = 1.0
             px, py, pz = points[m, 0], points[m, 1], points[m, 2]
             length = np.sqrt(px * px + py * py + pz * pz)
             off = 0.0
@@ -285,6 +294,7 @@ def _residuals(
             codes[k, m] = 1
             r = rho / sigma
             z[k, m] = r
+            spread[k, m] = sigma / usual
             if width <= 0 or abs(r) > 4 * width:
                 continue
             x = r / width
@@ -378,10 +388,28 @@ class Compared:
 
     z: Float32[ndarray, "k n"]
     codes: Int8[ndarray, "k n"]
+    spread: Float32[ndarray, "k n"]  # sigma of each residual, relative to what is usual on smooth surface
+
+    @cached_property
+    def density(self) -> Float32[ndarray, "k n"]:
+        """Of the residuals of points that lie on the other frame's surface.
+
+        Beside edges the decoder is wrong more often.
+        """
+        size = np.minimum(np.abs(self.z), np.float32(LARGEST_RESIDUAL))
+        wide = np.clip(self.spread, 1, LARGEST_SPREAD)
+        wrong, tail = WRONG_SHARE * wide, TAIL_SHARES[1] * wide
+        shares = 1 - wrong - tail - TAIL_SHARES[0], TAIL_SHARES[0], tail
+        found = wrong / np.float32(2 * LARGEST_RESIDUAL)
+        for share, sigma in zip(shares, TAIL_SIGMAS.tolist(), strict=True):
+            found += (
+                share * np.float32(1 / sigma / np.sqrt(2 * np.pi)) * np.exp(np.float32(-0.5 / sigma**2) * size * size)
+            )
+        return found
 
     def chosen(self, index: Int64[ndarray, "m"]) -> "Compared":
         """Some of the places."""
-        return Compared(self.z[index], self.codes[index])
+        return Compared(self.z[index], self.codes[index], self.spread[index])
 
     def noise(self, k: int, points: slice) -> float:
         """How much larger the residuals of some points are at a place than stated; at least 1."""
@@ -392,20 +420,11 @@ class Compared:
 
     def scaled(self, noise: Float64[ndarray, "n"]) -> "Compared":
         """Residuals in units of what they are found to be."""
-        return Compared(self.z / noise.astype(np.float32), self.codes)
+        return Compared(self.z / noise.astype(np.float32), self.codes, self.spread)
 
     def overlaps(self, other: "Compared", share: float) -> bool:
         """Whether the first place lets at least a share of the points be judged that the other's does."""
         return (self.codes[0] == JUDGED).sum() >= share * (other.codes[0] == JUDGED).sum()
-
-
-def density(z: Float32[ndarray, "*n"]) -> Float32[ndarray, "*n"]:
-    """Of residuals (in sigmas) of points that lie on the other frame's surface."""
-    size = np.minimum(np.abs(z), np.float32(LARGEST_RESIDUAL))
-    found = np.full(z.shape, (1 - TAIL_WEIGHTS.sum()) / (2 * LARGEST_RESIDUAL), np.float32)
-    for weight, sigma in zip(TAIL_WEIGHTS.tolist(), TAIL_SIGMAS.tolist(), strict=True):
-        found += np.float32(weight / sigma / np.sqrt(2 * np.pi)) * np.exp(np.float32(-0.5 / sigma**2) * size * size)
-    return found
 
 
 def density_elsewhere(z: Float32[ndarray, "*n"]) -> Float32[ndarray, "*n"]:
@@ -464,22 +483,28 @@ class PairEvidence:
         """Residuals, and normal equations with robust kernels of the given widths (sigmas) above 0."""
         k = len(places)
         H, g = np.zeros((k, UNKNOWNS, UNKNOWNS)), np.zeros((k, UNKNOWNS))
-        zs, codes = [], []
+        zs, codes, spreads = [], [], []
         R, t = np.ascontiguousarray(places.R), np.ascontiguousarray(places.t)
         own = np.ascontiguousarray(places.errors[:, :POSE_ERRORS]), np.ascontiguousarray(places.errors[:, POSE_ERRORS:])
         for reverse, (points, seen) in enumerate(((self._points[0], self.target), (self._points[1], self.source))):
             z, code = np.empty((k, len(points)), np.float32), np.empty((k, len(points)), np.int8)
+            spread = np.empty((k, len(points)), np.float32)
             model, parameters = for_loops(seen.camera)
             _residuals(
                 k, points, places.scale, R, t, bool(reverse), own[reverse], own[1 - reverse], seen.surface,
                 seen.smooth, BLOCK, model, parameters, seen.nothing.empty, seen.nothing.light, seen.hidden, LEAST_FACING_COSINE,
-                LEAST_LIT_COSINE, self.target.centroid, width, z, code, H, g,
+                LEAST_LIT_COSINE, self.target.centroid, width, seen.usual_sigma, z, code, spread, H, g,
             )  # fmt: skip
             zs.append(z)
             codes.append(code)
+            spreads.append(spread)
         i, j = np.tril_indices(UNKNOWNS, -1)
         H[:, j, i] = H[:, i, j]
-        return Compared(np.concatenate(zs, 1), np.concatenate(codes, 1)), H / self._mean_area, g / self._mean_area
+        return (
+            Compared(*(np.concatenate(each, 1) for each in (zs, codes, spreads))),
+            H / self._mean_area,
+            g / self._mean_area,
+        )
 
     def refined(
         self, places: Places, widths: Sequence[float], axis: Float64[ndarray, "k 3"] | None = None
@@ -520,7 +545,7 @@ class PairEvidence:
 
     def commonness(self, found: Compared) -> tuple[Commonness, Commonness]:
         """What places say, at all of which the frames do not belong, about the points of each frame."""
-        p, other = density(found.z), density_elsewhere(found.z)
+        p, other = found.density, density_elsewhere(found.z)
         judged, absent = found.codes == JUDGED, found.codes == ABSENT
         fits = np.where(judged, USUAL_SHARE * p / (USUAL_SHARE * p + (1 - USUAL_SHARE) * other), 0)
         n = len(self._points[0])
@@ -538,7 +563,7 @@ class PairEvidence:
     def _against_elsewhere(self, found: Compared, common: tuple[Commonness, Commonness]) -> Float64[ndarray, "k n"]:
         share = np.concatenate([c.share for c in common]).astype(np.float32)
         gone = np.concatenate([np.full(len(c.fits), c.absent_share) for c in common])
-        p, other = density(found.z), density_elsewhere(found.z)
+        p, other = found.density, density_elsewhere(found.z)
         seen = np.log(p / (share * p + (1 - share) * other)) + np.log((1 - ABSENT_SHARE) / (1 - gone))
         absent = np.log(ABSENT_SHARE / gone)
         return np.where(found.codes == JUDGED, seen, np.where(found.codes == ABSENT, absent, 0))
@@ -550,8 +575,7 @@ class PairEvidence:
         only one of them judges counts as against elsewhere.
         """
         known = (found.codes == JUDGED) | (found.codes == ABSENT)
-        usual = float(np.log(density(np.array([USUAL_RESIDUAL], np.float32)))[0])
-        each = np.where(found.codes == ABSENT, np.log(ABSENT_SHARE) + usual, np.log(density(found.z)))
+        each = np.where(found.codes == ABSENT, np.log(ABSENT_SHARE) + USUAL_LOG_DENSITY, np.log(found.density))
         J = known.astype(np.float32)
         alone = (self._against_elsewhere(found, common) / self.area).astype(np.float32)
         L = np.where(known, each / self.area, 0).astype(np.float32)
@@ -564,9 +588,22 @@ class PairEvidence:
         return found.noise(k, slice(None, n)), found.noise(k, slice(n, None))
 
     def scaled(self, found: Compared, noise: tuple[float, float]) -> Compared:
-        """Residuals in units of what they are found to be."""
+        """Residuals in units of what they are found to be, and of those of each place on smooth surface.
+
+        Frames that look the same way share the decoder's systematic errors, so they agree a little better: a place at
+        which they do is not more likely for that.
+        """
         each = [np.full(len(points), size) for points, size in zip(self._points, noise, strict=True)]
-        return found.scaled(np.concatenate(each))
+        found = found.scaled(np.concatenate(each))
+        z, judged = found.z.copy(), found.codes == JUDGED
+        group = np.searchsorted(SPREADS, found.spread)
+        for k in range(len(z)):
+            for g in range(len(SPREADS) + 1):
+                here = judged[k] & (group[k] == g)
+                if here.sum() >= FEWEST_JUDGED:
+                    own = np.quantile(np.abs(z[k][here]), NOISE_QUANTILES[0]) / NOISE_RESIDUALS[0]
+                    z[k][here] /= np.clip(own, 1 / LARGEST_SHARED, LARGEST_SHARED)
+        return Compared(z, found.codes, found.spread)
 
     def by_likelihood(self, found: Compared) -> Float64[ndarray, "k"]:
         """By how many nats each place leads the others, at worst; of places that see enough of each other's surface."""
@@ -582,7 +619,7 @@ class PairEvidence:
         """By how many nats the first place of one is more likely than that of another, on points that both judge."""
         a, b = first.codes[0], other.codes[0]
         both = (a == JUDGED) & (b == JUDGED)
-        ratio = np.where(both, np.log(density(first.z[0])) - np.log(density(other.z[0])), 0)
+        ratio = np.where(both, np.log(first.density[0]) - np.log(other.density[0]), 0)
         gone = np.log(ABSENT_SHARE) * (((a == ABSENT) & (b == JUDGED)) * 1.0 - ((b == ABSENT) & (a == JUDGED)))
         return float(((ratio + gone) / self.area).sum())
 
