@@ -100,8 +100,8 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
         return f"{group} connection to the other frames {why}; capture views {remedy}{more if exclusion.slips else ''}"
     return (
         f"its best partner, {exclusion.partner}, shares {exclusion.overlap:.0%} of the surface, and "
-        f"{exclusion.fitness:.0%} of what both saw agrees (needed: {exclusion.least_overlap:.0%} and "
-        f"{exclusion.least_fitness:.0%}); capture views in between"
+        f"{exclusion.fitness:.0%} of what both saw agrees, which does not say where they belong (evidence of "
+        f"{exclusion.log_odds:.0f} nats, needed: {exclusion.least_odds:.0f}); capture views in between"
     )
 
 

@@ -299,7 +299,7 @@ EXCLUSIONS: list[tuple[Exclusion, tuple[str, ...]]] = [
     (PairsContradict("a", 9, 6), ("6 of its 9 pairs", "capture this view again")),
     (CoordinatesDisagree("a", ("a",)), ("its coordinates contradict", "capture this view again")),
     (CoordinatesDisagree("a", ("a", "b")), ("its coordinates and those of b agree",)),
-    (PoorPair("a", "b", 0.11, 0.23, 0.15, 0.6), ("partner, b,", "11%", "23%", "15% and 60%", "capture views")),
+    (PoorPair("a", "b", 0.11, 0.23, 4.4, 10.0), ("partner, b,", "11%", "23%", "4 nats", "needed: 10", "capture views")),
     (UndecidedProjector("a", 12.3), ("12 degrees apart", "show parts at other depths")),
 ]
 

@@ -5,6 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity, exps_at
 from sl_nerfstudio.registration.assembly import Pivots
+from sl_nerfstudio.registration.evidence import Commonness
 from sl_nerfstudio.registration.pairs import PairMatch, Rival
 
 NO_SLIP = np.array([0.0, 0, 0, 0, 0, 1, 0])  # the direction of a slip: about the line of sight
@@ -16,7 +17,7 @@ def edge(
     j: int,
     noise: float = 0.0,
     rng: np.random.Generator | None = None,
-    fitness: float = 0.98,
+    log_odds: float = 100.0,
     rivals: tuple[Rival, ...] = (),
     sigma_deg: float = 0.5,
     slip_deg: float = 0.0,
@@ -28,8 +29,9 @@ def edge(
         c = np.array([0.0, 0.0, -4 / nodes[j].scale])
         S = Similarity(float(np.exp(noise * rng.standard_normal())), turn, c - turn @ c) @ S
     return PairMatch(
-        i, j, S, np.eye(7) / max(noise, 1e-3) ** 2, 0.5, fitness, 0.02, rivals, sigma_deg, slip_deg, NO_SLIP
-    )
+        i, j, S, np.eye(7) / max(noise, 1e-3) ** 2, 0.5, 0.98, log_odds, rivals, sigma_deg, slip_deg, NO_SLIP,
+        (Commonness.none(1), Commonness.none(1)), (1.0, 1.0),
+    )  # fmt: skip
 
 
 def pivots_of(nodes: list[Similarity]) -> Pivots:

@@ -27,16 +27,56 @@ def _template() -> FrameCloud:
     return clouds_of(rig_of(2, 40), 40)[0]
 
 
-def cloud_of_depth(depth: Callable[[ndarray, ndarray], ndarray], size: int = 100, sigma: float = 1e-3) -> FrameCloud:
-    """A surface that fills the image: distance along the line of sight by the normalised pixel (x, y), up is +y."""
-    camera = Device(size, size, 1.35 * size, 1.35 * size, size / 2, size / 2)
-    uv = np.stack(np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5), -1).reshape(-1, 2)
-    ray = directions(camera, uv)
-    x, y = ray[:, 0] / -ray[:, 2], ray[:, 1] / -ray[:, 2]
-    points = ray / -ray[:, 2:] * depth(x, y)[:, None]
+def cloud_of_points(camera: Device, uv: ndarray, points: ndarray, sigma: float) -> FrameCloud:
+    """Points in camera axes seen at some pixels; half of their variance is noise, half that of one pose error."""
     even = np.full(len(uv), sigma / np.sqrt(2))
     errors = np.outer(even, np.eye(5)[0])
     return replace(_template(), camera=camera, uv_camera=uv, points=points, sigma_noise=even, pose_errors=errors)
+
+
+def pixels_of(size: int) -> tuple[Device, ndarray]:
+    """A square camera, and its pixel centres."""
+    camera = Device(size, size, 1.35 * size, 1.35 * size, size / 2, size / 2)
+    return camera, np.stack(np.meshgrid(np.arange(size) + 0.5, np.arange(size) + 0.5), -1).reshape(-1, 2)
+
+
+def cloud_of_depth(depth: Callable[[ndarray, ndarray], ndarray], size: int = 100, sigma: float = 1e-3) -> FrameCloud:
+    """A surface that fills the image: distance along the line of sight by the normalised pixel (x, y), up is +y."""
+    camera, uv = pixels_of(size)
+    ray = directions(camera, uv)
+    x, y = ray[:, 0] / -ray[:, 2], ray[:, 1] / -ray[:, 2]
+    return cloud_of_points(camera, uv, ray / -ray[:, 2:] * depth(x, y)[:, None], sigma)
+
+
+def cloud_of_body(
+    outside: Callable[[ndarray], ndarray], S_world_camera: Similarity, size: int = 100, sigma: float = 1e-3
+) -> FrameCloud:
+    """What a camera sees of a body: `outside` is a function of points of the world, below zero inside.
+
+    The first change of its sign along each ray between half and twice the distance to the origin, then by bisection.
+    """
+    camera, uv = pixels_of(size)
+    ray = directions(camera, uv) / np.linalg.norm(directions(camera, uv), axis=1, keepdims=True)
+    way = ray @ S_world_camera.R.T
+    middle = float(np.linalg.norm(S_world_camera.t))
+    near, far = np.full(len(uv), 0.5 * middle), np.full(len(uv), np.nan)
+    for distance in np.linspace(0.5, 2, 300) * middle:
+        inside = outside(S_world_camera.t + distance * way) < 0
+        far = np.where(np.isnan(far) & inside, distance, far)
+        near = np.where(np.isnan(far), distance, near)
+    hit = np.isfinite(far)
+    near, far, way = near[hit], far[hit], way[hit]
+    for _ in range(40):
+        half = (near + far) / 2
+        inside = outside(S_world_camera.t + half[:, None] * way) < 0
+        near, far = np.where(inside, near, half), np.where(inside, half, far)
+    return cloud_of_points(camera, uv[hit], ray[hit] * (near / S_world_camera.scale)[:, None], sigma)
+
+
+def relief(x: ndarray, y: ndarray, odd: float) -> ndarray:
+    """Distance of a surface that is the same after half a turn about the line of sight where `odd` is 0."""
+    even = np.cos(17 * x) * np.cos(11 * y) + np.sin(9 * x) * np.sin(13 * y) + 4 * x * y
+    return 3 + 0.06 * even + odd * np.exp(-((x - 0.12) ** 2 + (y - 0.1) ** 2) / 0.006)
 
 
 def with_wall(cloud: FrameCloud, distance: float) -> FrameCloud:

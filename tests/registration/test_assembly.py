@@ -10,14 +10,13 @@ from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarities, Similarity, exps_at, log_at, logs_at
-from sl_nerfstudio.registration import assembly
-from sl_nerfstudio.registration.agreement import Side
 from sl_nerfstudio.registration.assembly import Assembly, Pivots, optimise_pose_graph
+from sl_nerfstudio.registration.evidence import Commonness, FrameEvidence, ScanEvidence, frame_evidence
 from sl_nerfstudio.registration.pairs import PairMatch, Rival, edge_weights
-from sl_nerfstudio.registration.surfaces import build_surface_map
 from tests.bundle_adjustment.analytic import rig_of
-from tests.registration.analytic_clouds import clouds_of, difference, part_of, similarities_of
+from tests.registration.analytic_clouds import clouds_of, difference, part_of, rolled, similarities_of
 from tests.registration.graph_edges import edge, exp_at, pivots_of, turned
+from tests.registration.shaped_clouds import cloud_of_depth, relief
 
 SIZE, FRAMES = 70, 8
 RIG = part_of(rig_of(18, SIZE), list(range(FRAMES)))  # 20 degrees from frame to frame
@@ -26,28 +25,33 @@ FIRST, SECOND = [(0, 1), (1, 2), (2, 3), (0, 2)], [(4, 5), (5, 6), (6, 7), (5, 7
 
 
 @pytest.fixture(scope="module")
-def sides():
-    maps = [build_surface_map(c) for c in clouds_of(RIG, SIZE, noise=0.1)]
-    return [Side.sampled(m, 400, np.random.default_rng(0)) for m in maps]
+def frames() -> list[FrameEvidence]:
+    return [frame_evidence(c) for c in clouds_of(RIG, SIZE, noise=0.1)]
 
 
-def assembled(sides, edges, slipping=()):
-    pivots = Pivots(np.stack([s.map.centroid for s in sides]), np.array([s.map.radius for s in sides]))
-    return Assembly(sides, pivots, edges, slipping).grow()
+def assembly_of(frames, edges, **kwargs) -> Assembly:
+    """Of frames of whose points no pair has shown anything."""
+    scan = ScanEvidence(frames, [Commonness.none(len(f.points)) for f in frames], np.ones(len(frames)))
+    pivots = Pivots(np.stack([f.centroid for f in frames]), np.array([f.radius for f in frames]))
+    return Assembly(scan, pivots, edges, **kwargs)
+
+
+def assembled(frames, edges, **kwargs):
+    return assembly_of(frames, edges, **kwargs).grow()
 
 
 def right(pairs, **kwargs) -> list[PairMatch]:
     return [edge(TRUE, i, j, **kwargs) for i, j in pairs]
 
 
-def wrong(sides, i: int, j: int, degrees: float = 40.0, **kwargs) -> PairMatch:
+def wrong(frames, i: int, j: int, degrees: float = 40.0, **kwargs) -> PairMatch:
     """A registration that is off by a rotation about the object."""
     true = edge(TRUE, i, j, **kwargs)
-    return replace(true, S_target_source=turned(true.S_target_source, degrees, sides[j].map.centroid))
+    return replace(true, S_target_source=turned(true.S_target_source, degrees, frames[j].centroid))
 
 
-def rival(sides, i: int, j: int, degrees: float, ratio: float) -> Rival:
-    return Rival(wrong(sides, i, j, degrees).S_target_source, ratio)
+def rival(frames, i: int, j: int, degrees: float, log_odds: float = 0.0) -> Rival:
+    return Rival(wrong(frames, i, j, degrees).S_target_source, log_odds)
 
 
 def frames_of(components) -> list[list[int]]:
@@ -64,71 +68,77 @@ def assert_right(component) -> None:
 
 
 @pytest.mark.parametrize("across", [[(3, 4)], [(3, 4), (2, 4), (3, 5)]], ids=["one pair", "several pairs"])
-def test_pairs_that_determine_everything_join_two_blocks_in_either_direction(sides, across):
+def test_pairs_that_determine_everything_join_two_blocks_in_either_direction(frames, across):
     edges = right([*FIRST, *SECOND, *across])
     edges[::2] = [
         replace(e, source=e.target, target=e.source, S_target_source=e.S_target_source.inverse()) for e in edges[::2]
     ]
-    (whole,) = assembled(sides, edges)
+    (whole,) = assembled(frames, edges)
     assert sorted(whole) == list(range(FRAMES))
     assert_right(whole)
 
 
 @pytest.mark.parametrize("degrees", [15, 25, 40, 90, 180])
-def test_two_blocks_with_one_wrong_pair_between_them_stay_apart(sides, degrees):
+def test_two_blocks_with_one_wrong_pair_between_them_stay_apart(frames, degrees):
     """The pair is as good as any by its own figures; the frames across contradict it."""
-    components = assembled(sides, [*right([*FIRST, *SECOND]), wrong(sides, 3, 4, degrees)])
+    components = assembled(frames, [*right([*FIRST, *SECOND]), wrong(frames, 3, 4, degrees)])
     assert frames_of(components) == [[0, 1, 2, 3], [4, 5, 6, 7]]
     for component in components:
         assert_right(component)
 
 
-def test_right_pairs_outvote_a_wrong_one_that_seems_better(sides):
-    edges = [*right([*FIRST, *SECOND, (3, 4), (2, 4)], fitness=0.97), wrong(sides, 3, 5, 40, fitness=0.99)]
-    (whole,) = assembled(sides, edges)
+def test_right_pairs_outvote_a_wrong_one_that_seems_better(frames):
+    edges = [*right([*FIRST, *SECOND, (3, 4), (2, 4)]), wrong(frames, 3, 5, 40, log_odds=300.0)]
+    (whole,) = assembled(frames, edges)
     assert sorted(whole) == list(range(FRAMES))
     assert_right(whole)
 
 
-def test_a_pair_with_a_rival_as_good_joins_nothing(sides):
-    doubtful = edge(TRUE, 3, 4, rivals=(rival(sides, 3, 4, 30, 0.95),))
-    components = assembled(sides, [*right([*FIRST, *SECOND]), doubtful])
-    assert frames_of(components) == [[0, 1, 2, 3], [4, 5, 6, 7]]
-    clear = edge(TRUE, 3, 4, rivals=(rival(sides, 3, 4, 30, 0.3),))
-    assert len(assembled(sides, [*right([*FIRST, *SECOND]), clear])) == 1
+@pytest.mark.parametrize("said", [0.0, -60.0], ids=["as good", "worse"])
+def test_a_rival_counts_by_what_the_frames_saw(frames, said):
+    """Not by what its pair says: only what is the same after half a turn is not joined."""
+    doubtful = edge(TRUE, 3, 4, rivals=(rival(frames, 3, 4, 30, said),))
+    (whole,) = assembled(frames, [*right([*FIRST, *SECOND]), doubtful])
+    assert_right(whole)
+    half = Rival(Similarity(1.0, rolled(180), np.zeros(3)), said)
+    for odd, joined in ((0.0, False), (0.35, True)):
+        both = [frame_evidence(cloud_of_depth(lambda x, y, odd=odd: relief(x, y, odd)))] * 2
+        alike = edge([Similarity.identity()] * 2, 0, 1, rivals=(half,))
+        assert len(assembled(both, [alike])) == 2 - joined
+        assert (assembly_of(both, [alike]).decide(*({k: Similarity.identity()} for k in (1, 0))) is None) is not joined
 
 
-def test_pairs_that_are_undecided_alone_decide_together(sides):
+def test_the_order_of_capture_decides_only_what_surfaces_do_not():
+    same, half = Similarity.identity(), Similarity(1.0, rolled(180), np.zeros(3))
+    for odd, usual, true in ((0.0, same, same), (0.0, half, half), (0.35, half, same)):
+        frames = [frame_evidence(cloud_of_depth(lambda x, y, odd=odd: relief(x, y, odd)))] * 2
+        found = assembly_of(
+            frames,
+            [edge([same, same], 0, 1, rivals=(Rival(half, 0.0),))],
+            prior=lambda i, j, S, usual=usual: -25.0 * float(np.linalg.norm(S.R - usual.R) > 1),
+        )
+        (whole,) = found.grow()
+        assert found.by_order is (odd == 0)
+        np.testing.assert_allclose((whole[1].inverse() @ whole[0]).R, true.R, atol=1e-9)
+
+
+def test_pairs_that_are_undecided_alone_decide_together(frames):
     """What one takes for possible, the others do not: only the truth is said by all."""
     edges = right([*FIRST, *SECOND])
-    edges += [edge(TRUE, i, j, rivals=(rival(sides, i, j, turn, 0.95),))
+    edges += [edge(TRUE, i, j, rivals=(rival(frames, i, j, turn),))
               for (i, j), turn in zip([(3, 4), (2, 4), (3, 5)], (30, -35, 60), strict=True)]  # fmt: skip
-    (whole,) = assembled(sides, edges)
+    (whole,) = assembled(frames, edges)
     assert_right(whole)
-
-
-def test_a_pair_whose_rotation_is_open_joins_nothing_alone_and_something_together(sides):
-    slipping = right([(3, 4)], sigma_deg=8.0)
-    assert len(assembled(sides, [*right([*FIRST, *SECOND]), *slipping])) == 2
-    assert len(assembled(sides, [*right([*FIRST, *SECOND]), *right([(3, 4), (2, 4), (3, 5)], sigma_deg=8.0)])) == 1
-
-
-def test_a_pair_that_may_slip_keeps_apart_only_what_would_not_notice_it(sides, monkeypatch):
-    """The balls on the disk show a turn about the line of sight, whatever one pair says of itself."""
-    edges, slipping = right([*FIRST, *SECOND, (3, 4), (2, 4)]), right([(3, 5)], slip_deg=8.0)
-    assert frames_of(assembled(sides, edges, slipping)) == [list(range(FRAMES))]
-    monkeypatch.setattr(assembly, "SLIP_RISE", 1.0)
-    assert frames_of(assembled(sides, edges, slipping)) == [[0, 1, 2, 3], [4, 5, 6, 7]]
 
 
 @settings(max_examples=2)
 @given(st.randoms(use_true_random=False))
-def test_the_result_does_not_depend_on_the_order_of_the_edges(sides, random):
+def test_the_result_does_not_depend_on_the_order_of_the_edges(frames, random):
     edges = right([*FIRST, *SECOND, (2, 4)])
-    edges.append(wrong(sides, 3, 4, 50))
-    edges = [replace(e, overlap=0.5 + 0.01 * k) for k, e in enumerate(edges)]
-    expected = assembled(sides, edges)
-    found = assembled(sides, random.sample(edges, len(edges)))
+    edges.append(wrong(frames, 3, 4, 50))
+    edges = [replace(e, log_odds=100.0 + k) for k, e in enumerate(edges)]
+    expected = assembled(frames, edges)
+    found = assembled(frames, random.sample(edges, len(edges)))
     assert frames_of(found) == frames_of(expected)
     for a, b in zip(found, expected, strict=True):
         first = min(a)
@@ -196,15 +206,16 @@ def test_wrong_pairs_are_rejected_and_do_no_harm(wrong):
     assert largest_error(solution.S_world_camera, nodes) < 0.05
 
 
-def test_pairs_that_agree_with_each_other_and_fit_worse_do_not_move_an_assembled_frame():
-    """Frames slide on a smooth surface: five pairs put frame 4 to one wrong place, two to the right one."""
+def test_pairs_that_agree_with_each_other_but_have_rivals_do_not_move_an_assembled_frame():
+    """Five pairs put frame 4 to one wrong place, and say that others are as likely; two put it to the right one."""
     rng = np.random.default_rng(5)
     nodes = random_nodes(8, rng)
     slid = list(nodes)
     slid[4] = Similarity(1.0, Rotation.from_rotvec([0.0, 0.5, 0.0]).as_matrix(), np.zeros(3)) @ nodes[4]
+    others = tuple(Rival(Similarity.identity(), 0.0) for _ in range(4))
     right = [edge(nodes, i, j, 0.005, rng) for i, j in ring(8) if 4 not in (i, j)]
-    right += [edge(nodes, i, j, 0.005, rng, fitness=0.99) for i, j in ((3, 4), (4, 5))]
-    wrong = [edge(slid, i, j, 0.005, rng, fitness=0.87) for i, j in ((0, 4), (1, 4), (2, 4), (4, 6), (4, 7))]
+    right += [edge(nodes, i, j, 0.005, rng) for i, j in ((3, 4), (4, 5))]
+    wrong = [edge(slid, i, j, 0.005, rng, rivals=others) for i, j in ((0, 4), (1, 4), (2, 4), (4, 6), (4, 7))]
     edges = right + wrong
     solution = optimise_pose_graph(edges, pivots_of(nodes), start_of(nodes), edge_weights(edges))
     assert largest_error(solution.S_world_camera, nodes) < 0.05

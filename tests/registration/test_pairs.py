@@ -15,8 +15,10 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.registration import pairs
 from sl_nerfstudio.registration.agreement import Hypotheses, Side, Tolerance
+from sl_nerfstudio.registration.evidence import Commonness, Frame
 from sl_nerfstudio.registration.pairs import (
     ANYWHERE,
+    LEAST_ODDS,
     NEARBY,
     NEIGHBOURS,
     PairMatch,
@@ -27,20 +29,19 @@ from sl_nerfstudio.registration.pairs import (
     is_accepted,
     is_ambiguous,
     likeness,
-    quality,
     register_pair,
-    rise_of,
     rotations,
     screw_motion,
+    search_places,
     turn_by_tone,
     weakest_rotation,
     without_guess,
 )
-from sl_nerfstudio.registration.surfaces import SurfaceMap, build_surface_map
+from sl_nerfstudio.registration.surfaces import build_surface_map
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, difference, on_a_ball, part_of, rolled, similarities_of
 from tests.registration.graph_edges import exp_at
-from tests.registration.shaped_clouds import cloud_of_depth, rendered, with_wall
+from tests.registration.shaped_clouds import cloud_of_depth, relief, rendered, with_wall
 
 SIZE, FRAMES = 100, 18  # 20 degrees from frame to frame
 RIG = rig_of(FRAMES, SIZE)
@@ -53,36 +54,36 @@ def clouds():
 
 
 @pytest.fixture(scope="module")
-def maps(clouds):
-    return [build_surface_map(c) for c in clouds]
+def frames(clouds):
+    return [Frame.of(c) for c in clouds]
 
 
 def between(i: int, j: int) -> Similarity:
     return TRUE[j].inverse() @ TRUE[i]
 
 
-def registered(maps, search: Search = NEIGHBOURS, guess: Similarity | None = None, seed: int = 0) -> PairMatch:
-    found = register_pair((maps[0], maps[1]), (0, 1), search, np.random.default_rng(seed), guess)
+def registered(frames, search: Search = NEIGHBOURS, guess: Similarity | None = None, seed: int = 0) -> PairMatch:
+    found = register_pair((frames[0], frames[1]), (0, 1), search, np.random.default_rng(seed), guess)
     assert found is not None
     return found
 
 
-def assert_near(found: Similarity, true: Similarity, target: SurfaceMap, degrees: float = 1.0) -> None:
-    angle, shift, scale = difference(found, true, target.centroid)
-    assert angle < degrees and shift < 0.02 * target.radius and scale < 0.02
+def assert_near(found: Similarity, true: Similarity, target: Frame, degrees: float = 1.0) -> None:
+    angle, shift, scale = difference(found, true, target.map.centroid)
+    assert angle < degrees and shift < 0.02 * target.map.radius and scale < 0.02
 
 
 # Search and refinement.
 
 
 @pytest.mark.parametrize(("i", "j"), [(0, 1), (4, 6), (9, 8)])
-def test_neighbours_find_each_other(maps, i, j):
-    found = register_pair((maps[i], maps[j]), (i, j), NEIGHBOURS, np.random.default_rng(0))
-    assert_near(found.S_target_source, between(i, j), maps[j])
+def test_neighbours_find_each_other(frames, i, j):
+    found = register_pair((frames[i], frames[j]), (i, j), NEIGHBOURS, np.random.default_rng(0))
+    assert_near(found.S_target_source, between(i, j), frames[j])
     assert (found.source, found.target) == (i, j)
     assert found.fitness > 0.9 and found.fitness >= found.overlap > 0.4
-    assert 0 < found.rms < 0.03 and found.rotation_sigma_deg < 1
-    assert not is_ambiguous(found)
+    assert found.lead > LEAST_ODDS and found.rotation_sigma_deg < 1
+    assert is_accepted(found) and not is_ambiguous(found)
 
 
 def test_a_rolled_camera_is_found_without_a_guess():
@@ -92,55 +93,59 @@ def test_a_rolled_camera_is_found_without_a_guess():
     camera, relative = rig.T_world_camera.clone(), rig.T_camera_projector.clone()
     camera[1], relative[1] = camera[1] @ roll, roll.T @ relative[1]
     held = replace(rig, T_world_camera=camera, T_camera_projector=relative)
-    pair = [build_surface_map(c) for c in clouds_of(held, SIZE)]
+    pair = [Frame.of(c) for c in clouds_of(held, SIZE)]
     true = Similarity(1.0, rolled(130), np.zeros(3)).inverse() @ between(0, 1)
     assert_near(registered(pair, ANYWHERE).S_target_source, true, pair[1])
 
 
-def test_a_wrong_guess_is_corrected_within_its_reach(maps):
+def test_a_wrong_guess_is_corrected_within_its_reach(frames):
     S = between(2, 3)
     wrong = Similarity(1.1 * S.scale, rolled(12) @ S.R, rolled(12) @ S.t)
-    assert_near(registered(maps[2:4], NEARBY, wrong).S_target_source, S, maps[3])
+    assert_near(registered(frames[2:4], NEARBY, wrong).S_target_source, S, frames[3])
 
 
-def test_the_scale_stays_within_its_bound(maps, monkeypatch):
+def test_the_scale_stays_within_its_bound(frames, monkeypatch):
     """Without the prior a cloud would collapse onto a patch; the bound holds whatever the prior says."""
     monkeypatch.setattr(pairs, "SCALE_SIGMA", 100.0)
     S = between(2, 3)
     wrong = Similarity(3.0 * S.scale, S.R, S.t)
-    found = register_pair((maps[2], maps[3]), (2, 3), NEARBY, np.random.default_rng(0), wrong)
-    assert found is None or abs(np.log(found.S_target_source.scale / wrong.scale)) <= pairs.LARGEST_LOG_SCALE + 1e-9
+    found = search_places((frames[2].map, frames[3].map), NEARBY, np.random.default_rng(0), wrong)
+    assert np.abs(np.log(found.scale / wrong.scale)).max() <= pairs.LARGEST_LOG_SCALE + 1e-9
+    match = register_pair((frames[2], frames[3]), (2, 3), NEARBY, np.random.default_rng(0), wrong)
+    assert match is None or not is_accepted(match) or abs(np.log(match.S_target_source.scale / S.scale)) < 0.02
 
 
-def test_frames_that_share_nothing_do_not_match(maps):
-    found = register_pair((maps[0], maps[9]), (0, 9), NEIGHBOURS, np.random.default_rng(0))
-    assert found is None or found.fitness < 0.85 or found.overlap < 0.15
-    empty = replace(maps[0], valid=np.zeros_like(maps[0].valid))
-    for pair in ((empty, maps[1]), (maps[1], empty)):
+def test_frames_that_share_nothing_do_not_match(frames):
+    found = register_pair((frames[0], frames[9]), (0, 9), NEIGHBOURS, np.random.default_rng(0))
+    assert found is None or not is_accepted(found)
+
+
+def test_a_frame_without_points_matches_nothing(clouds, frames):
+    sparse = {k: getattr(clouds[0], k)[::50] for k in ("uv_camera", "points", "sigma_noise", "pose_errors")}
+    empty = Frame.of(replace(clouds[0], **sparse))
+    for pair in ((empty, frames[1]), (frames[1], empty)):
         assert register_pair(pair, (0, 1), NEIGHBOURS, np.random.default_rng(0)) is None
 
 
 @pytest.mark.parametrize("walled", [(True, False), (False, True)], ids=["source", "target"])
-def test_a_wall_that_one_frame_alone_saw_does_not_move_the_alignment(clouds, maps, walled):
+def test_a_wall_that_one_frame_alone_saw_does_not_move_the_alignment(clouds, frames, walled):
     distance = 3 * np.linalg.norm(clouds[2].centroid)
-    pair = [
-        build_surface_map(with_wall(clouds[k], distance)) if w else maps[k] for k, w in zip((2, 3), walled, strict=True)
-    ]
-    assert_near(registered(pair).S_target_source, between(2, 3), maps[3])
+    pair = [Frame.of(with_wall(clouds[k], distance)) if w else frames[k] for k, w in zip((2, 3), walled, strict=True)]
+    assert_near(registered(pair).S_target_source, between(2, 3), frames[3])
 
 
-def test_the_result_does_not_depend_on_the_lengths_of_the_baselines(clouds, maps):
+def test_the_result_does_not_depend_on_the_lengths_of_the_baselines(clouds, frames):
     """One cloud ten times as large, the other a third: the same pair."""
     factors, lengths = (10.0, 1 / 3), ("points", "sigma_noise", "pose_errors")
     scaled = [
-        build_surface_map(replace(clouds[k], **{key: f * getattr(clouds[k], key) for key in lengths}))
+        Frame.of(replace(clouds[k], **{key: f * getattr(clouds[k], key) for key in lengths}))
         for k, f in zip((2, 3), factors, strict=True)
     ]
-    a, b = registered(maps[2:4]), registered(scaled)
+    a, b = registered(frames[2:4]), registered(scaled)
     S = Similarity.scaling(1 / factors[1]) @ b.S_target_source @ Similarity.scaling(factors[0])
-    angle, shift, scale = difference(S, a.S_target_source, maps[3].centroid)
-    assert angle < 0.05 and shift < 1e-3 * maps[3].radius and scale < 1e-3
-    for key in ("overlap", "fitness", "rms", "rotation_sigma_deg"):
+    angle, shift, scale = difference(S, a.S_target_source, frames[3].map.centroid)
+    assert angle < 0.05 and shift < 1e-3 * frames[3].map.radius and scale < 1e-3
+    for key in ("overlap", "fitness", "log_odds", "rotation_sigma_deg"):
         assert getattr(b, key) == pytest.approx(getattr(a, key), rel=0.02, abs=5e-3)
 
 
@@ -158,8 +163,8 @@ def test_every_rotation_within_reach_has_a_start_nearby(degrees, seed):
     assert np.degrees((starts * wanted.inv()).magnitude().min()) < 5.0 * np.sqrt(3) / 2 + 2.5
 
 
-def test_starts_keep_the_object_where_it_is(maps):
-    S = between(2, 3)
+def test_starts_keep_the_object_where_it_is(frames):
+    S, maps = between(2, 3), [frame.map for frame in frames]
     found, count = around_guess(maps[3], NEARBY, S), len(rotations(NEARBY))
     assert len(found) == count * len(maps[3].views)
     for k in range(len(found)):
@@ -177,61 +182,51 @@ def test_starts_keep_the_object_where_it_is(maps):
 # Rivals, acceptance, weights.
 
 
-def relief(x, y, odd: float):
-    """The same after half a turn about the line of sight where `odd` is 0."""
-    even = np.cos(17 * x) * np.cos(11 * y) + np.sin(9 * x) * np.sin(13 * y) + 4 * x * y
-    return 3 + 0.06 * even + odd * np.exp(-((x - 0.12) ** 2 + (y - 0.1) ** 2) / 0.006)
-
-
 @pytest.mark.parametrize(("odd", "ambiguous"), [(0.0, True), (0.35, False)])
 def test_half_a_turn_of_a_symmetric_surface_is_a_rival_as_good_as_the_best(odd, ambiguous):
-    surface = build_surface_map(cloud_of_depth(lambda x, y: relief(x, y, odd)))
-    found = registered((surface, surface), ANYWHERE)
-    ratios = [rival.ratio for rival in found.rivals]
-    assert ratios == sorted(ratios, reverse=True) and all(0 < ratio <= 1 for ratio in ratios)
-    assert is_ambiguous(found) is ambiguous and found.second_best_ratio == max(ratios, default=0.0)
+    frame = Frame.of(cloud_of_depth(lambda x, y: relief(x, y, odd)))
+    centre, radius = frame.map.centroid, frame.map.radius
+    found = registered((frame, frame), ANYWHERE)
+    odds = [rival.log_odds for rival in found.rivals]
+    assert odds == sorted(odds, reverse=True) and is_accepted(found)
+    assert is_ambiguous(found) is ambiguous and found.lead == min([found.log_odds, *(-each for each in odds)])
     turns = Similarity.identity(), Similarity(1.0, rolled(180), np.zeros(3))
     said = [found.S_target_source, *(r.S_target_source for r in found.rivals)]
     if ambiguous:
-        assert found.second_best_ratio > 0.97
+        assert abs(odds[0]) < LEAST_ODDS / 2
         for true in turns:
-            assert min(difference(S, true, surface.centroid)[0] for S in said[:2]) < 1
+            assert min(difference(S, true, centre)[0] for S in said[:2]) < 1
     else:
-        assert difference(found.S_target_source, turns[0], surface.centroid)[0] < 1
+        assert difference(found.S_target_source, turns[0], centre)[0] < 1
     for k, a in enumerate(said):
         for b in said[:k]:
-            angle, shift, _ = difference(a, b, surface.centroid)
-            assert angle > pairs.SAME_ROTATION_DEG or shift > pairs.SAME_SHIFT * surface.radius
+            angle, shift, _ = difference(a, b, centre)
+            assert angle > pairs.SAME_PLACE_DEG or shift > pairs.SAME_PLACE_SHIFT * radius
 
 
-def match(fitness: float = 0.9, overlap: float = 0.5, ratio: float = 0.2) -> PairMatch:
+def match(log_odds: float = 50.0, *rivals: float) -> PairMatch:
     S = Similarity.identity()
-    return PairMatch(0, 1, S, np.eye(7), overlap, fitness, 0.02, (Rival(S, ratio),), 0.5, 0.0, np.zeros(7))
+    return PairMatch(
+        0, 1, S, np.eye(7), 0.5, 0.9, log_odds, tuple(Rival(S, odds) for odds in rivals), 0.5, 0.0, np.zeros(7),
+        (Commonness.none(0), Commonness.none(0)), (1.0, 1.0),
+    )  # fmt: skip
 
 
-def test_a_pair_needs_overlap_and_fitness():
-    accepted = [is_accepted(match(f, o)) for f, o in ((0.9, 0.5), (0.59, 0.5), (0.9, 0.14))]
-    assert accepted == [True, False, False]
+@given(st.floats(-100, 100), st.lists(st.floats(-100, 0), max_size=3))
+def test_a_pair_is_accepted_by_its_odds_and_ambiguous_by_its_rivals(odds, rivals):
+    found = match(odds, *rivals)
+    assert is_accepted(found) is (odds > LEAST_ODDS)
+    assert is_ambiguous(found) is any(rival > -LEAST_ODDS for rival in rivals)
+    assert (found.lead > LEAST_ODDS) is (is_accepted(found) and not any(rival >= -LEAST_ODDS for rival in rivals))
 
 
-@given(st.floats(0, 1), st.floats(0, 1), st.floats(0, 1))
-def test_quality_grows_with_overlap_and_fitness_and_falls_with_ambiguity(overlap, fitness, ratio):
-    value = quality(match(fitness, overlap, ratio))
-    assert 0 <= value <= 1
-    assert quality(match(min(1.0, fitness + 0.1), overlap, ratio)) >= value
-    assert quality(match(fitness, min(1.0, overlap + 0.1), ratio)) >= value
-    assert quality(match(fitness, overlap, 1.0)) <= value
-
-
-@given(st.lists(st.tuples(st.floats(0.6, 1), st.floats(0, 1)), max_size=12))
-def test_weights_prefer_pairs_that_fit_like_the_good_ones(said):
-    weight = edge_weights([match(fitness=f, ratio=r) for f, r in said])
-    fitness, clear = np.array([f for f, _ in said]), np.array([r <= 0.85 for _, r in said], dtype=bool)
-    assert len(weight) == len(said) and ((weight >= 0.02) & (weight <= 1)).all()
-    good = fitness >= np.quantile(fitness, 0.75) if said else clear
-    np.testing.assert_array_equal(weight[good & clear], 1.0)
-    np.testing.assert_array_equal(weight[good & ~clear], 0.5)
-    assert (np.diff(weight[clear][np.argsort(fitness[clear])]) >= 0).all()
+@given(st.lists(st.floats(-100, 0), max_size=40), st.integers(0, 39))
+def test_the_weight_of_a_pair_is_about_the_probability_that_it_is_right(rivals, k):
+    """Bayes with equal priors; a rival that becomes more likely takes weight away."""
+    (weight,) = edge_weights([match(50.0, *rivals)])
+    assert weight == pytest.approx(max(1 / (1 + np.exp(rivals).sum()), 0.02))
+    assert edge_weights([match(50.0, *rivals, -1.0)])[0] <= weight
+    assert len(edge_weights([])) == 0
 
 
 # Slip.
@@ -267,7 +262,8 @@ def test_the_least_known_rotation_is_the_unobservable_one(seed):
     free /= np.linalg.norm(free[3:6])
     others = np.linalg.svd(free[None])[2][1:]
     information = others.T @ np.diag(rng.uniform(1, 10, 6)) @ others + 1e-9 * np.eye(7)
-    found = weakest_rotation(information)
+    found, known = weakest_rotation(information)
+    assert known[0] < 1e-6 and (np.diff(known) >= 0).all()
     np.testing.assert_allclose(found * np.sign(found @ free), free, atol=1e-5)
     assert np.linalg.norm(found[3:6]) == pytest.approx(1)
 
@@ -275,13 +271,13 @@ def test_the_least_known_rotation_is_the_unobservable_one(seed):
 def matched(scene: str, i: int, j: int):
     """Two frames of a rendered scene, registered, with the truth."""
     some = rendered(scene, (i, j))
-    maps, S = [build_surface_map(c) for c in some.clouds], some.S_world_camera
-    return registered(maps), S[1].inverse() @ S[0], maps[1], some
+    frames, S = [Frame.of(c) for c in some.clouds], some.S_world_camera
+    return registered(frames), S[1].inverse() @ S[0], frames[1].map, some
 
 
 def test_slipping_about_the_axis_of_a_vase_is_found_and_its_size_is_stated():
     found, true, _, some = matched("vase", 4, 5)
-    assert found.rotation_sigma_deg >= found.slip_deg >= pairs.SLIP_ANGLES_DEG[0]
+    assert found.rotation_sigma_deg >= found.slip_deg > 0 and not found.holds
     # The least known rotation is that about the vase's axis, in the target's camera axes.
     w, vectors = np.linalg.eigh(np.linalg.inv(found.information)[3:6, 3:6])
     axis = some.T_world_camera[1][:3, :3].T @ [0, 0, 1]
@@ -298,11 +294,11 @@ def test_objects_with_a_relief_do_not_slip(scene):
     found, true, target, _ = matched(scene, 4, 5)
     angle, shift, _ = difference(found.S_target_source, true, target.centroid)
     assert angle < 1.5 and shift < 0.03 * target.radius
-    assert found.slip_deg == 0 and found.rotation_sigma_deg < pairs.SLIP_ANGLES_DEG[0] / 2
+    assert found.slip_deg == 0 and found.rotation_sigma_deg < 2
 
 
 def test_a_ball_slips_though_its_place_is_known(clouds):
-    ball = registered([build_surface_map(on_a_ball(clouds[k], 0.8, str(k))) for k in (0, 1)])
+    ball = registered([Frame.of(on_a_ball(clouds[k], 0.8, str(k))) for k in (0, 1)])
     assert ball.fitness > 0.9 and ball.rotation_sigma_deg > 3 and ball.slip_deg > 0
     assert np.linalg.eigvalsh(ball.information[:3, :3])[0] > 100 * np.radians(1 / ball.rotation_sigma_deg) ** 2
 
@@ -310,53 +306,44 @@ def test_a_ball_slips_though_its_place_is_known(clouds):
 def test_a_few_points_that_a_motion_moves_hold_a_table_in_place():
     """All points but those of a ridge stay on the table's plane, whatever the motion; their number says nothing."""
 
-    def table(ridge: float) -> SurfaceMap:
+    def table(ridge: float) -> Frame:
         def depth(x, y):
             height = ridge * np.clip(1 - np.abs(x - 0.3) / 0.06, 0, None) * (np.abs(y - 0.1) < 0.15)
             return 3 - height
 
-        return build_surface_map(cloud_of_depth(depth, 120))
+        return Frame.of(cloud_of_depth(depth, 120))
 
     bare, held = (registered((one, one), NEARBY) for one in (table(0.0), table(0.12)))
-    assert bare.slip_deg == pairs.SLIP_ANGLES_DEG[-1] and not bare.holds
+    assert bare.slip_deg >= 12 and not bare.holds
     assert held.holds
-
-
-def test_fewer_points_must_notice_a_motion_all_the_more():
-    """The rise of a mean in its standard errors, which go with the root of the number of points."""
-    every, some = [0.18, 0.24, 0.9, 0.9], [0.02, 0.08, 0.1, 0.1]
-    assert rise_of(np.array([every, some])) == pytest.approx(0.6 / 3)
-    assert rise_of(2 * np.array([every, some])) == pytest.approx(0.6 / 3)
-    assert rise_of(np.array([every, every])) == pytest.approx(0.06 / 0.9)
-    assert rise_of(np.array([every, [0.0] * 4])) == pytest.approx(0.06 / 0.9)
-    assert rise_of(np.zeros((2, 4))) == 0
 
 
 # Tone.
 
 
 @cache
-def vase(first: int, second: int) -> tuple[tuple[SurfaceMap, SurfaceMap], Similarity]:
+def vase(first: int, second: int) -> tuple[tuple[Frame, Frame], Similarity]:
     """Two frames of a vase with blotches, and the true similarity."""
     some = rendered("vase", (first, second), resolution=300, lit=True)
-    maps, S = tuple(build_surface_map(c) for c in some.clouds), some.S_world_camera
-    return (maps[0], maps[1]), S[1].inverse() @ S[0]
+    frames, S = tuple(Frame.of(c) for c in some.clouds), some.S_world_camera
+    return (frames[0], frames[1]), S[1].inverse() @ S[0]
 
 
-def with_tone(surface: SurfaceMap, tone: np.ndarray) -> SurfaceMap:
-    return replace(surface, tone=np.where(np.isfinite(surface.tone), tone, np.nan).astype(np.float32))
+def with_tone(frame: Frame, tone: np.ndarray) -> Frame:
+    known = np.isfinite(frame.map.tone)
+    return replace(frame, map=replace(frame.map, tone=np.where(known, tone, np.nan).astype(np.float32)))
 
 
-def blotches(surface: SurfaceMap, seed: int) -> np.ndarray:
+def blotches(frame: Frame, seed: int) -> np.ndarray:
     """Random ones, about as large as those of the vase."""
-    return gaussian_filter(np.random.default_rng(seed).standard_normal(surface.valid.shape), 4)
+    return gaussian_filter(np.random.default_rng(seed).standard_normal(frame.map.valid.shape), 4)
 
 
 @pytest.mark.parametrize("pair", [(4, 6), pytest.param((15, 17), marks=pytest.mark.slow)])
 def test_the_blotches_of_a_vase_hold_it(pair):
     """Surfaces alone leave the frames turned by more; with tones, the turn is right to within what is stated."""
-    maps, true = vase(*pair)
-    bare, found = registered([with_tone(m, np.full_like(m.tone, np.nan)) for m in maps]), registered(maps)
+    frames, true = vase(*pair)
+    bare, found = registered([with_tone(f, np.full_like(f.map.tone, np.nan)) for f in frames]), registered(frames)
     assert bare.slip_deg > 0 and not bare.by_tone
     assert found.slip_deg == 0 and found.by_tone
     off = angle_deg((found.S_target_source @ true.inverse()).R)
@@ -367,17 +354,17 @@ def test_the_blotches_of_a_vase_hold_it(pair):
 @pytest.mark.parametrize("seed", range(3))
 def test_tones_that_are_not_the_surface_s_hold_nothing(seed):
     """Those of another vase; and the same at the same places of both images: a highlight, not a print."""
-    maps, _ = vase(4, 6)
-    made = blotches(maps[0], seed)
-    assert not registered((maps[0], with_tone(maps[1], blotches(maps[1], seed)))).by_tone
-    assert not registered((with_tone(maps[0], made), with_tone(maps[1], made))).by_tone
+    (first, second), _ = vase(4, 6)
+    made = blotches(first, seed)
+    assert not registered((first, with_tone(second, blotches(second, seed)))).by_tone
+    assert not registered((with_tone(first, made), with_tone(second, made))).by_tone
 
 
 def test_a_motion_that_leaves_both_surfaces_ends_without_a_word():
     """What shrinks or grows threefold within a radian has nothing to follow after some steps."""
-    maps, true = vase(4, 6)
+    frames, true = vase(4, 6)
     rng = np.random.default_rng(0)
-    sides = Side.sampled(maps[0], 400, rng), Side.sampled(maps[1], 400, rng)
+    sides = Side.sampled(frames[0].map, 400, rng), Side.sampled(frames[1].map, 400, rng)
     away = np.array([5.0, -3.0, 4.0, 0.6, 0.0, 0.8, 1.1])
     with np.errstate(all="raise", under="ignore"):
         assert turn_by_tone(sides, true, away, Tolerance(0.0, 2.0)) is None
@@ -385,7 +372,7 @@ def test_a_motion_that_leaves_both_surfaces_ends_without_a_word():
 
 def test_likeness_is_the_correlation_of_the_tones_that_meet():
     """Of a frame with itself it is one; with the opposite tones minus one; turned away it is not known."""
-    (surface, _), _ = vase(4, 6)
+    surface = vase(4, 6)[0][0].map
     far = Similarity(1.0, Rotation.from_rotvec([0, 2.5, 0]).as_matrix(), np.zeros(3))
     both = Hypotheses.of(Similarity.identity(), far)
     one, opposite = (

@@ -1,0 +1,355 @@
+"""Likelihood of places: residuals against a plain formula, derivatives against differences, and what places it tells."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy import ndarray
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.registration.agreement import HIDDEN_DEPTH, LEAST_LIT_COSINE
+from sl_nerfstudio.registration.evidence import (
+    ABSENT,
+    BLOCK,
+    HIDDEN,
+    JUDGED,
+    LEAST_FACING_COSINE,
+    POSE_ERRORS,
+    UNDECODED,
+    UNKNOWNS,
+    Commonness,
+    FrameEvidence,
+    PairEvidence,
+    Places,
+    frame_evidence,
+)
+from sl_nerfstudio.registration.pairs import (
+    FINE_WIDTHS,
+    LEAST_ODDS,
+    SEARCH_WIDTHS,
+    STEP_DEG,
+    best_match,
+    walk,
+)
+from sl_nerfstudio.registration.surfaces import EmptyPlaces
+from sl_nerfstudio.relative_pose.epipolar import directions
+from tests.registration.graph_edges import exp_at
+from tests.registration.shaped_clouds import cloud_of_body
+from tests.relative_pose.two_views import pose_of
+
+PROJECTOR = Device(30, 24, 26.0, 27.0, 15.5, 11.0, k1=0.05)
+CAMERAS = {
+    "pinhole": Device(60, 45, 75.0, 78.0, 28.0, 24.0),
+    "lens": Device(60, 45, 75.0, 78.0, 28.0, 24.0, k1=-0.3, k2=0.1, p1=5e-3, p2=-8e-3),
+    "DOE": Device(60, 45, 75.0, 78.0, 28.0, 24.0, k1=0.2, k2=-0.05, p1=-4e-3, p2=6e-3, model="DOE"),
+}
+
+
+def unit(x: ndarray) -> ndarray:
+    return x / np.linalg.norm(x, axis=-1, keepdims=True)
+
+
+def rays_of(camera: Device) -> ndarray:
+    uv = np.stack(np.meshgrid(np.arange(camera.w) + 0.5, np.arange(camera.h) + 0.5), -1).reshape(-1, 2)
+    return unit(directions(camera, uv)).reshape(camera.h, camera.w, 3)
+
+
+# Residuals, against a plain formula.
+
+
+def any_frame(camera: Device, seed: int, points: int = 400) -> FrameEvidence:
+    """Distances, normals and errors that vary from place to place, with holes: any will do for a formula."""
+    rng = np.random.default_rng(seed)
+    ray = rays_of(camera)
+    h, w = ray.shape[:2]
+    distance = 3 + 0.05 * rng.standard_normal((h, w))
+    distance[rng.random((h, w)) < 0.05] = np.nan
+    surface = np.stack([distance, rng.uniform(0.02, 0.1, (h, w))], -1).astype(np.float32)
+    blocks = -(-h // BLOCK), -(-w // BLOCK)
+    coarse = unit(-ray[::BLOCK, ::BLOCK] + 0.7 * rng.standard_normal((*blocks, 3)))
+    coarse[rng.random(blocks) < 0.1] = np.nan
+    smooth = np.concatenate([0.05 * rng.standard_normal((*blocks, 5)), coarse], -1).astype(np.float32)
+    some = rng.integers(0, h * w, points)
+    position = ray.reshape(-1, 3)[some] * (3 + 0.4 * rng.standard_normal((points, 1)))
+    normal = unit(-ray.reshape(-1, 3)[some] + 0.6 * rng.standard_normal((points, 3)))
+    sigma, errors = rng.uniform(0.02, 0.1, (points, 1)), 0.05 * rng.standard_normal((points, 5))
+    T = np.linalg.inv(pose_of((0.6, 0.1, 0.2), (0.0, 0.0, -3.0), 20.0))
+    nothing = EmptyPlaces(rng.random((h, w)) < 0.7, PROJECTOR, T, rng.uniform(2.5, 3.5, (24, 30)))
+    return FrameEvidence(
+        camera, surface, smooth, nothing, np.concatenate([position, normal, sigma, errors], 1), some,
+        position.mean(0), 1.0, 2.0, 0.05,
+    )  # fmt: skip
+
+
+def lit(nothing: EmptyPlaces, p: ndarray, n: ndarray) -> bool:
+    """Whether the frame's camera would see a place, and its projector's light reach it."""
+    R, t = nothing.T_projector_camera[:3, :3], nothing.T_projector_camera[:3, 3]
+    q, m = R @ p + t, R @ n
+    uv, front = project(Intrinsics.of(nothing.projector, torch.float64), torch.from_numpy(q[None]))
+    column, row = np.floor(uv[0].numpy()).astype(int)
+    h, w = nothing.reach.shape
+    if not (front[0] and 0 <= column < w and 0 <= row < h):
+        return False
+    facing = min(-unit(p) @ n, -unit(q) @ m)
+    return bool(facing >= LEAST_LIT_COSINE and np.linalg.norm(q) < nothing.reach[row, column])
+
+
+def plain(mover: FrameEvidence, seen: FrameEvidence, S: Similarity, own: ndarray, other: ndarray):
+    """Residuals in sigmas, sigmas and codes of the mover's points on the other's surface, ray by ray."""
+    out = []
+    for point in mover.points:
+        position, normal, sigma, errors = np.split(point, [3, 6, 7])
+        along = unit(position)
+        p = S.points((position + along * (errors @ own))[None])[0]
+        n, distance = S.R @ normal, np.linalg.norm(p)
+        uv, front = project(Intrinsics.of(seen.camera, torch.float64), torch.from_numpy(p[None]))
+        u, v = uv[0].numpy() - 0.5
+        h, w = seen.surface.shape[:2]
+        if not (front[0] and 0 <= u < w - 1 and 0 <= v < h - 1) or -unit(p) @ n < LEAST_FACING_COSINE:
+            out.append((0.0, np.nan, 0))
+            continue
+        i, j = int(v), int(u)
+        four = seen.surface[i : i + 2, j : j + 2, 0].astype(np.float64)
+        surface = np.array([1 - (v - i), v - i]) @ four @ np.array([1 - (u - j), u - j])
+        nearest = int(v + 0.5), int(u + 0.5)
+        if np.isnan(four).any():
+            out.append((0.0, np.nan, ABSENT if seen.nothing.empty[nearest] and lit(seen.nothing, p, n) else UNDECODED))
+            continue
+        block = seen.smooth[nearest[0] // BLOCK, nearest[1] // BLOCK].astype(np.float64)
+        behind = distance - surface - block[:5] @ other
+        if behind > HIDDEN_DEPTH * seen.radius:
+            out.append((0.0, np.nan, HIDDEN))
+            continue
+        facing = block[5:] if -unit(p) @ block[5:] > 0.1 else n
+        slope = S.scale * (S.R @ along) @ facing / (unit(p) @ facing)  # of the distance behind, by the point's own ray
+        twist = (four[0, 0] + four[1, 1] - four[0, 1] - four[1, 0]) / 2
+        spread = np.sqrt(seen.surface[nearest][1] ** 2 + (slope * sigma[0]) ** 2 + twist**2)
+        out.append((behind / spread, spread, JUDGED))
+    z, spread, codes = map(np.array, zip(*out, strict=True))
+    return z, spread, codes
+
+
+@pytest.mark.parametrize("name", sorted(CAMERAS))
+@pytest.mark.parametrize("seed", range(2))
+def test_residuals_are_those_of_the_plain_formula_both_ways(name, seed):
+    rng = np.random.default_rng(seed)
+    source, target = any_frame(CAMERAS[name], seed), any_frame(CAMERAS["lens"], seed + 10)
+    some = [exp_at(x, target.centroid, 1.0, 1.0) for x in 0.1 * rng.standard_normal((3, 7))]
+    places = replace(Places.of(*some), errors=rng.standard_normal((3, 2 * POSE_ERRORS)))
+    found = PairEvidence(source, target).compare(places)
+    for k, S in enumerate(some):
+        own, other = np.split(places.errors[k], 2)
+        parts = plain(source, target, S, own, other), plain(target, source, S.inverse(), other, own)
+        z, spread, codes = (np.concatenate(each) for each in zip(*parts, strict=True))
+        np.testing.assert_array_equal(found.codes[k], codes)
+        assert set(codes.tolist()) == {0, JUDGED, ABSENT, UNDECODED, HIDDEN}
+        np.testing.assert_allclose(found.z[k], z, rtol=2e-4, atol=1e-4)
+        usual = np.repeat([target.usual_sigma, source.usual_sigma], [len(source.points), len(target.points)])
+        judged = codes == JUDGED
+        np.testing.assert_allclose(found.spread[k, judged], (spread / usual)[judged], rtol=1e-4)
+
+
+# Normal equations, against differences of the residuals of a surface that is known exactly.
+
+
+def plane_frame(camera: Device, normal: ndarray, height: float, seed: int) -> FrameEvidence:
+    """A plane `normal . p = -height` before a camera with points about it, all of one sigma; constant pose errors."""
+    rng = np.random.default_rng(seed)
+    ray, errors = rays_of(camera), 0.02 * rng.standard_normal(5)
+    h, w = ray.shape[:2]
+    distance = -height / (ray @ normal)
+    surface = np.stack([distance, np.full((h, w), 0.05)], -1).astype(np.float32)
+    smooth = np.tile(np.r_[errors, normal].astype(np.float32), (-(-h // BLOCK), -(-w // BLOCK), 1))
+    rows, columns = rng.integers(20, h - 20, 60), rng.integers(20, w - 20, 60)
+    position = ray[rows, columns] * (distance[rows, columns] + 0.05 * rng.standard_normal(60))[:, None]
+    parts = position, np.tile(normal, (60, 1)), np.zeros((60, 1)), 0.02 * rng.standard_normal((60, 5))
+    nothing = EmptyPlaces(np.zeros((h, w), dtype=bool), PROJECTOR, np.eye(4), np.zeros((24, 30)))
+    return FrameEvidence(
+        camera, surface, smooth, nothing, np.concatenate(parts, 1), rows * w + columns, position.mean(0), 1.0, 1.0, 0.05
+    )
+
+
+@pytest.mark.parametrize("name", sorted(CAMERAS))
+def test_the_normal_equations_are_those_of_differences_of_the_residuals(name):
+    camera = replace(CAMERAS[name].scaled(8), w=480, h=360)  # fine enough for the surface between its places
+    rng = np.random.default_rng(3)
+    normal, height, width = unit(np.array([0.2, -0.3, 1.0])), 3.0, 2.5
+    S = Similarity(1.3, Rotation.from_rotvec([0.05, -0.1, 0.2]).as_matrix(), np.array([0.1, 0.05, 0.2]))
+    seen = S.R.T @ normal, (height + normal @ S.t) / S.scale  # of the same plane by the source
+    source, target = plane_frame(camera, *seen, 1), plane_frame(camera, normal, height, 2)
+    errors = rng.standard_normal(2 * POSE_ERRORS)
+
+    def residuals(x: ndarray) -> ndarray:
+        """Of the points of both frames, in sigmas."""
+        T, out = exp_at(x[:7], target.centroid, 1.0, 9.0) @ S, []
+        both = np.split(errors + x[7:], 2)
+        for mover, other, M, n, h, k in (
+            (source, target, T, normal, height, 0), (target, source, T.inverse(), *seen, 1),
+        ):  # fmt: skip
+            p, e = mover.points[:, :3], mover.points[:, 7:]
+            p = M.points(p + unit(p) * (e @ both[k])[:, None])
+            beyond = np.linalg.norm(p, axis=1) + h / (unit(p) @ n)
+            out.append((beyond - other.smooth[0, 0, :5].astype(np.float64) @ both[1 - k]) / 0.05)
+        return np.concatenate(out)
+
+    r, step = residuals(np.zeros(UNKNOWNS)), 1e-5
+    J = np.stack([(residuals(step * d) - residuals(-step * d)) / (2 * step) for d in np.eye(UNKNOWNS)], 1)
+    weight = np.where(np.abs(r) <= 4 * width, 1 / (1 + (r / width) ** 2) ** 2, 0)
+    places = replace(Places.of(S), errors=errors[None])
+    found, H, g = PairEvidence(source, target)._compare(places, np.array([width]))
+    assert (found.codes == JUDGED).all() and (weight > 0).sum() > 60
+    np.testing.assert_allclose(found.z[0], r, atol=2e-3)
+    wanted = (J * weight[:, None]).T @ J
+    np.testing.assert_allclose(H[0], wanted, atol=3e-3 * np.abs(wanted).max())
+    size = np.sqrt(np.diag(wanted))
+    np.testing.assert_allclose(H[0] / np.outer(size, size), wanted / np.outer(size, size), atol=5e-3)
+    np.testing.assert_allclose(g[0] / size, J.T @ (weight * r) / size, atol=2e-2)
+
+
+# Bodies that are known exactly, seen by two cameras that go around the axis z.
+
+
+def view(turn_deg: float, scale: float = 1.0, up_deg: float = 25.0) -> Similarity:
+    """A camera three units from the origin, looking at it, with a baseline of some length."""
+    a, b = np.radians([turn_deg, up_deg])
+    back = np.array([np.cos(a) * np.cos(b), np.sin(a) * np.cos(b), np.sin(b)])
+    right = unit(np.cross([0.0, 0, 1], back))
+    return Similarity(scale, np.stack([right, np.cross(back, right), back], 1), 3 * back)
+
+
+def lump(p: ndarray) -> ndarray:
+    """A ball with low waves all over it."""
+    x, y, z = p.T
+    return np.linalg.norm(p, axis=1) - 0.6 - 0.05 * (np.sin(5 * x + 1) * np.cos(4 * y) + np.sin(6 * z + 2 * x))
+
+
+def pot(p: ndarray, bump: float = 0.0) -> ndarray:
+    """A body of revolution about z, with a small bump on its side."""
+    across = np.linalg.norm(p[:, :2], axis=1)
+    side = np.maximum(across - 0.5 + 0.1 * np.cos(3 * p[:, 2]), np.abs(p[:, 2]) - 0.6)
+    at = np.linalg.norm(p - [0.42, 0.1, 0.1], axis=1)
+    return side - bump * np.exp(-((at / 0.08) ** 2))
+
+
+def pair_of(outside: Callable[[ndarray], ndarray], *views: Similarity, size: int = 100, sigma: float = 2e-3):
+    """Two frames and the similarity of the first to the second."""
+    clouds = [cloud_of_body(outside, S, size, sigma) for S in views]
+    return [frame_evidence(c) for c in clouds], views[1].inverse() @ views[0]
+
+
+def about_axis(views: tuple[Similarity, ...], degrees: float) -> Similarity:
+    """The place at which the first frame is turned about the axis."""
+    turn = Similarity(1.0, Rotation.from_euler("z", degrees, degrees=True).as_matrix(), np.zeros(3))
+    return views[1].inverse() @ turn @ views[0]
+
+
+def no_knowledge(*frames: FrameEvidence) -> tuple[Commonness, ...]:
+    return tuple(Commonness.none(len(f.points)) for f in frames)
+
+
+@pytest.fixture(scope="module")
+def lumps():
+    return pair_of(lump, view(0.0, 1.0), view(20.0, 1.3), size=200)
+
+
+@settings(max_examples=5)
+@given(st.integers(0, 10**6))
+def test_an_exact_pair_is_refined_to_the_truth(lumps, seed):
+    (source, target), true = lumps
+    x = np.random.default_rng(seed).normal(0, 0.02, 7)
+    start = exp_at(x, target.centroid, target.radius, 1.0) @ true
+    places, _ = PairEvidence(source, target).refined(Places.of(start), (*SEARCH_WIDTHS, *FINE_WIDTHS, 3.0, 3.0))
+    D = places.similarity(0) @ true.inverse()
+    off = D.points(target.centroid[None])[0] - target.centroid
+    print(angle_deg(D.R), np.linalg.norm(off) / target.radius, np.log(D.scale), places.errors)
+    assert np.radians(angle_deg(D.R)) < 1e-4 and abs(np.log(D.scale)) < 1e-4
+    assert np.linalg.norm(off) < 1e-4 * target.radius
+
+
+@pytest.fixture(scope="module")
+def compared(lumps):
+    """Some places of a pair, the truth first, with residuals."""
+    (source, target), true = lumps
+    rng = np.random.default_rng(0)
+    moved = [exp_at(x, target.centroid, target.radius, 1.0) for x in rng.normal(0, 0.01, (5, 7))]
+    places = replace(Places.of(true, *(D @ true for D in moved)), errors=0.1 * rng.standard_normal((6, 10)))
+    return source, target, places
+
+
+def test_places_are_compared_alike_whichever_frame_is_the_source_and_whatever_the_units(compared):
+    source, target, places = compared
+    forward = PairEvidence(source, target)
+    found = forward.compare(places)
+    common = no_knowledge(source, target)
+    leads = forward.comparison(found, common)
+    np.testing.assert_array_equal(leads, -leads.T)
+    assert leads[0, 1:].min() > 0 and np.ptp(leads) > 10
+    back = [places.similarity(k).inverse() for k in range(len(places))]
+    halves = places.errors[:, POSE_ERRORS:], places.errors[:, :POSE_ERRORS]
+    backward = PairEvidence(target, source)
+    again = backward.compare(replace(Places.of(*back), errors=np.concatenate(halves, 1)))
+    pairs = [(backward, again, common[::-1])]
+    long = [in_units(f, s) for f, s in ((source, 10.0), (target, 0.2))]
+    there = [Similarity.scaling(0.2) @ places.similarity(k) @ Similarity.scaling(0.1) for k in range(len(places))]
+    larger = PairEvidence(*long)
+    pairs.append((larger, larger.compare(replace(Places.of(*there), errors=places.errors)), common))
+    for evidence, other, known in pairs:
+        assert (np.sort(other.codes) == np.sort(found.codes)).mean() > 0.9999
+        np.testing.assert_allclose(evidence.comparison(other, known), leads, atol=0.02)
+        np.testing.assert_allclose(evidence.log_odds(other, known), forward.log_odds(found, common), atol=0.02)
+        np.testing.assert_allclose(evidence.by_likelihood(other), forward.by_likelihood(found), atol=0.02)
+
+
+def in_units(frame: FrameEvidence, factor: float) -> FrameEvidence:
+    """The same frame with a baseline of another length."""
+    points, smooth = frame.points.copy(), frame.smooth.copy()
+    points[:, :3] *= factor
+    points[:, 6:] *= factor
+    smooth[..., :5] *= factor
+    nothing = frame.nothing
+    T = nothing.T_projector_camera.copy()
+    T[:3, 3] *= factor
+    return replace(
+        frame, surface=frame.surface * np.float32(factor), smooth=smooth, points=points,
+        centroid=factor * frame.centroid, radius=factor * frame.radius, usual_sigma=factor * frame.usual_sigma,
+        nothing=replace(nothing, T_projector_camera=T, reach=factor * nothing.reach),
+    )  # fmt: skip
+
+
+TURNS = (0.0, 4.0, 9.0, -15.0, 40.0)
+
+
+@pytest.mark.parametrize(("bump", "least", "most"), [(0.0, -1.0, 1.0), (0.08, LEAST_ODDS, np.inf)])
+def test_a_surface_of_revolution_says_nothing_about_a_turn_and_a_bump_on_it_does(bump, least, most):
+    views = view(0.0), view(20.0, 1.4)
+    (source, target), _ = pair_of(lambda p: pot(p, bump), *views)
+    evidence = PairEvidence(source, target)
+    places, _ = evidence.refined(Places.of(*(about_axis(views, t) for t in TURNS)), FINE_WIDTHS)
+    found = evidence.compare(places)
+    leads = evidence.comparison(found, evidence.commonness(found))[0, 1:]
+    print(bump, leads, evidence.log_odds(found, evidence.commonness(found)))
+    assert (leads > least).all() and (leads < most).all()
+
+
+def test_a_walk_reaches_the_turn_that_no_slope_leads_to():
+    """From 40 degrees beside it; refined from there alone the frames stay turned."""
+    views = view(0.0), view(20.0, 1.4)
+    (source, target), true = pair_of(lambda p: pot(p, 0.08), *views)
+    evidence = PairEvidence(source, target)
+    start, H = evidence.refined(Places.of(about_axis(views, 40.0)), FINE_WIDTHS)
+    assert angle_deg(start.R[0] @ true.R.T) > 35
+    way = walk(evidence, start, H[0])
+    off = [angle_deg(way.R[k] @ true.R.T) for k in range(len(way))]
+    print(min(off), max(off), len(way))
+    assert min(off) < STEP_DEG
+    match = best_match(evidence, way, (0, 1))
+    assert match is not None and match.slip_deg == 0 and match.lead > LEAST_ODDS
+    assert angle_deg(match.S_target_source.R @ true.R.T) < 0.5
+    alone = best_match(evidence, start, (0, 1))
+    assert alone is None or angle_deg(alone.S_target_source.R @ true.R.T) > 35
