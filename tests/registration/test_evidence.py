@@ -1,4 +1,4 @@
-"""Likelihood of places: residuals against a plain formula, derivatives against differences, and what places it tells."""
+"""Likelihood of places: residuals against a plain formula, derivatives against differences, and what it decides."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -158,20 +158,23 @@ def test_residuals_are_those_of_the_plain_formula_both_ways(name, seed):
 # Normal equations, against differences of the residuals of a surface that is known exactly.
 
 
+SIGMA = 1e-3  # small against distances: derivatives are those at the surface
+
+
 def plane_frame(camera: Device, normal: ndarray, height: float, seed: int) -> FrameEvidence:
-    """A plane `normal . p = -height` before a camera with points about it, all of one sigma; constant pose errors."""
+    """A plane `normal . p = -height` before a camera, with points about it and pose errors that are everywhere alike."""
     rng = np.random.default_rng(seed)
-    ray, errors = rays_of(camera), 0.02 * rng.standard_normal(5)
+    ray, errors = rays_of(camera), SIGMA * rng.standard_normal(5)
     h, w = ray.shape[:2]
     distance = -height / (ray @ normal)
-    surface = np.stack([distance, np.full((h, w), 0.05)], -1).astype(np.float32)
+    surface = np.stack([distance, np.full((h, w), SIGMA)], -1).astype(np.float32)
     smooth = np.tile(np.r_[errors, normal].astype(np.float32), (-(-h // BLOCK), -(-w // BLOCK), 1))
     rows, columns = rng.integers(20, h - 20, 60), rng.integers(20, w - 20, 60)
-    position = ray[rows, columns] * (distance[rows, columns] + 0.05 * rng.standard_normal(60))[:, None]
-    parts = position, np.tile(normal, (60, 1)), np.zeros((60, 1)), 0.02 * rng.standard_normal((60, 5))
+    position = ray[rows, columns] * (distance[rows, columns] + SIGMA * rng.standard_normal(60))[:, None]
+    parts = position, np.tile(normal, (60, 1)), np.zeros((60, 1)), SIGMA * rng.standard_normal((60, 5))
     nothing = EmptyPlaces(np.zeros((h, w), dtype=bool), PROJECTOR, np.eye(4), np.zeros((24, 30)))
     return FrameEvidence(
-        camera, surface, smooth, nothing, np.concatenate(parts, 1), rows * w + columns, position.mean(0), 1.0, 1.0, 0.05
+        camera, surface, smooth, nothing, np.concatenate(parts, 1), rows * w + columns, position.mean(0), 1.0, 1.0, SIGMA
     )
 
 
@@ -195,16 +198,17 @@ def test_the_normal_equations_are_those_of_differences_of_the_residuals(name):
             p, e = mover.points[:, :3], mover.points[:, 7:]
             p = M.points(p + unit(p) * (e @ both[k])[:, None])
             beyond = np.linalg.norm(p, axis=1) + h / (unit(p) @ n)
-            out.append((beyond - other.smooth[0, 0, :5].astype(np.float64) @ both[1 - k]) / 0.05)
+            out.append((beyond - other.smooth[0, 0, :5].astype(np.float64) @ both[1 - k]) / SIGMA)
         return np.concatenate(out)
 
     r, step = residuals(np.zeros(UNKNOWNS)), 1e-5
     J = np.stack([(residuals(step * d) - residuals(-step * d)) / (2 * step) for d in np.eye(UNKNOWNS)], 1)
-    weight = np.where(np.abs(r) <= 4 * width, 1 / (1 + (r / width) ** 2) ** 2, 0)
     places = replace(Places.of(S), errors=errors[None])
     found, H, g = PairEvidence(source, target)._compare(places, np.array([width]))
-    assert (found.codes == JUDGED).all() and (weight > 0).sum() > 60
-    np.testing.assert_allclose(found.z[0], r, atol=2e-3)
+    judged = found.codes[0] == JUDGED
+    assert judged.sum() > 60
+    np.testing.assert_allclose(found.z[0, judged], r[judged], atol=1e-2)
+    weight = np.where(judged & (np.abs(r) <= 4 * width), 1 / (1 + (r / width) ** 2) ** 2, 0)
     wanted = (J * weight[:, None]).T @ J
     np.testing.assert_allclose(H[0], wanted, atol=3e-3 * np.abs(wanted).max())
     size = np.sqrt(np.diag(wanted))
@@ -223,10 +227,10 @@ def view(turn_deg: float, scale: float = 1.0, up_deg: float = 25.0) -> Similarit
     return Similarity(scale, np.stack([right, np.cross(back, right), back], 1), 3 * back)
 
 
-def lump(p: ndarray) -> ndarray:
-    """A ball with low waves all over it."""
+def waves(p: ndarray) -> ndarray:
+    """A ground with low waves, without edges."""
     x, y, z = p.T
-    return np.linalg.norm(p, axis=1) - 0.6 - 0.05 * (np.sin(5 * x + 1) * np.cos(4 * y) + np.sin(6 * z + 2 * x))
+    return z - 0.1 * (np.sin(3 * x + 1) * np.cos(2 * y) + np.sin(3 * y + 2 * x))
 
 
 def pot(p: ndarray, bump: float = 0.0) -> ndarray:
@@ -254,14 +258,14 @@ def no_knowledge(*frames: FrameEvidence) -> tuple[Commonness, ...]:
 
 
 @pytest.fixture(scope="module")
-def lumps():
-    return pair_of(lump, view(0.0, 1.0), view(20.0, 1.3), size=200)
+def ground():
+    return pair_of(waves, view(0.0, 1.0, 70.0), view(20.0, 1.3, 60.0), size=200)
 
 
 @settings(max_examples=5)
 @given(st.integers(0, 10**6))
-def test_an_exact_pair_is_refined_to_the_truth(lumps, seed):
-    (source, target), true = lumps
+def test_an_exact_pair_is_refined_to_the_truth(ground, seed):
+    (source, target), true = ground
     x = np.random.default_rng(seed).normal(0, 0.02, 7)
     start = exp_at(x, target.centroid, target.radius, 1.0) @ true
     places, _ = PairEvidence(source, target).refined(Places.of(start), (*SEARCH_WIDTHS, *FINE_WIDTHS, 3.0, 3.0))
@@ -273,9 +277,9 @@ def test_an_exact_pair_is_refined_to_the_truth(lumps, seed):
 
 
 @pytest.fixture(scope="module")
-def compared(lumps):
+def compared(ground):
     """Some places of a pair, the truth first, with residuals."""
-    (source, target), true = lumps
+    (source, target), true = ground
     rng = np.random.default_rng(0)
     moved = [exp_at(x, target.centroid, target.radius, 1.0) for x in rng.normal(0, 0.01, (5, 7))]
     places = replace(Places.of(true, *(D @ true for D in moved)), errors=0.1 * rng.standard_normal((6, 10)))
