@@ -311,10 +311,13 @@ def best_match(evidence: PairEvidence, starts: Places, pair: tuple[int, int]) ->
     # the peak of a feature is narrow: steps of a walk, or the slope of smooth surface, may miss its top
     near, H_near = evidence.refined(fine_steps(evidence, places[[best]], H[best]), FINE_WIDTHS)
     places, H = Places.joined([places, near]), np.concatenate([H, H_near])
-    found = evidence.compare(places)
-    noise = evidence.noise(found, int(np.argmax(evidence.by_likelihood(found))))
-    found = evidence.scaled(found, noise)
+    raw = evidence.compare(places)
+    found = evidence.scaled(raw, noise := evidence.noise(raw, int(np.argmax(evidence.by_likelihood(raw)))))
     best = int(np.argmax(evidence.by_likelihood(found)))
+    # which place it is, residuals in units of their own say; where exactly, the residuals themselves
+    turned, shifted = differences(places, places[[best]], target)
+    same = np.flatnonzero((turned <= SAME_PLACE_DEG) & (shifted <= SAME_PLACE_SHIFT))
+    best = int(same[np.argmax(evidence.by_likelihood(raw.chosen(same)))])
     turned, shifted = differences(places, places[[best]], target)
     common = evidence.commonness(found.chosen(np.flatnonzero((turned > SAME_PLACE_DEG) | (shifted > SAME_PLACE_SHIFT))))
     odds = -evidence.comparison(found, common)[best]
