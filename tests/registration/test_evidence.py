@@ -174,7 +174,16 @@ def plane_frame(camera: Device, normal: ndarray, height: float, seed: int) -> Fr
     parts = position, np.tile(normal, (60, 1)), np.zeros((60, 1)), SIGMA * rng.standard_normal((60, 5))
     nothing = EmptyPlaces(np.zeros((h, w), dtype=bool), PROJECTOR, np.eye(4), np.zeros((24, 30)))
     return FrameEvidence(
-        camera, surface, smooth, nothing, np.concatenate(parts, 1), rows * w + columns, position.mean(0), 1.0, 1.0, SIGMA
+        camera,
+        surface,
+        smooth,
+        nothing,
+        np.concatenate(parts, 1),
+        rows * w + columns,
+        position.mean(0) + normal,
+        1.0,
+        1.0,
+        SIGMA,
     )
 
 
