@@ -15,9 +15,8 @@ from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.processing.result import contradiction
-from sl_nerfstudio.registration import pairs
 from sl_nerfstudio.registration import register as module
-from sl_nerfstudio.registration.pairs import Rival
+from sl_nerfstudio.registration.pairs import LEAST_ODDS, Rival
 from sl_nerfstudio.registration.register import _doubtful, choose_projectors, chosen_clouds, register
 from sl_nerfstudio.registration.result import (
     NoCommonSurface,
@@ -185,7 +184,7 @@ def test_a_frame_of_another_object_is_named_and_left_out(clouds):
     assert isinstance(why, PoorPair | SeparateComponent) and why.frame == "stranger"
     assert why.partner in found.names[:5]
     if isinstance(why, PoorPair):
-        assert why.overlap < why.least_overlap == 0.15 or why.fitness < why.least_fitness == 0.6
+        assert why.log_odds < why.least_odds == LEAST_ODDS
     else:
         assert why.component == ("stranger",)
     assert np.isnan(found.T_world_camera[5]).all()
@@ -219,7 +218,7 @@ def test_a_frame_without_surface_shares_none(few):
 
 
 def test_a_frame_whose_surface_disagrees_says_how_much_agrees(few, monkeypatch):
-    monkeypatch.setattr(module, "LEAST_FRAME_FITNESS", 1.01)
+    monkeypatch.setattr(module, "LEAST_ODDS", np.inf)
     found = register(few[:3])
     assert not found.registered.any()
     assert [(type(e), e.frame) for e in found.exclusions] == [(SurfaceDisagrees, name) for name in found.names]
@@ -228,25 +227,25 @@ def test_a_frame_whose_surface_disagrees_says_how_much_agrees(few, monkeypatch):
 
 
 def test_a_frame_most_of_whose_pairs_say_another_pose_is_left_out():
-    """Two of its pairs are used, and two that fit a little better are not."""
+    """Two of its pairs are used, and two that are a little more likely are not."""
     nodes = [Similarity(1.0, T[:3, :3], T[:3, 3]) for T in RIG.T_world_camera[:5].numpy()]
     ring = [edge(nodes, i, j) for i, j in ((0, 1), (1, 2), (0, 2), (0, 4), (1, 4), (2, 4))]
-    of_three = [edge(nodes, k, 3, fitness=f) for k, f in ((0, 0.9), (1, 0.9), (2, 0.95), (4, 0.95))]
+    of_three = [edge(nodes, k, 3, log_odds=odds) for k, odds in ((0, 90.0), (1, 90.0), (2, 95.0), (4, 95.0))]
     names, inside = tuple("abcde"), np.ones(5, dtype=bool)
     used = np.array([True] * 6 + [True, True, False, False])
     assert _doubtful(names, inside, ring + of_three, used) == {3: PairsContradict("d", 4, 2)}
     used[-1] = True  # three of four agree
     assert _doubtful(names, inside, ring + of_three, used) == {}
-    used[-1], rival = False, (Rival(nodes[0], 0.95),)
+    used[-1], rival = False, (Rival(nodes[0], -1.0),)
     undecided = [replace(e, rivals=rival) if not u else e for e, u in zip(ring + of_three, used, strict=True)]
-    assert _doubtful(names, inside, undecided, used) == {}  # pairs that fit in two ways say nothing
+    assert _doubtful(names, inside, undecided, used) == {}  # pairs with rivals say nothing
     assert _doubtful(names, inside & (np.arange(5) != 4), ring + of_three, used) == {}
 
 
 def test_uncertainties_follow_their_limits(few, monkeypatch):
     assert register(few[:3]).uncertainties == ()
     monkeypatch.setattr(module, "LARGEST_SIGMA_ROTATION_DEG", 0.0)
-    monkeypatch.setattr(pairs, "AMBIGUOUS_RATIO", -1.0)
+    monkeypatch.setattr(module, "is_ambiguous", lambda _: True)
     found = register(few[:3])
     assert all(edge.undecided for edge in found.edges)
     assert found.uncertainties == tuple(

@@ -1,5 +1,6 @@
 """Which pairs of frames are compared, which hold, and what rough poses of cameras say."""
 
+from dataclasses import replace
 from itertools import combinations
 
 import numpy as np
@@ -9,10 +10,13 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.registration import view_graph as module
 from sl_nerfstudio.registration.assembly import Pivots
-from sl_nerfstudio.registration.pairs import PairMatch
-from sl_nerfstudio.registration.surfaces import build_surface_map
+from sl_nerfstudio.registration.evidence import Commonness, Frame
+from sl_nerfstudio.registration.pairs import NEIGHBOURS, PairMatch, Rival
 from sl_nerfstudio.registration.view_graph import (
+    MOST_BY_ORDER,
+    ViewGraph,
     compared_pairs,
     starting_similarities,
     with_common_centre,
@@ -47,15 +51,17 @@ CENTRE = np.array([0.1, 0.0, -3.0])
 PIVOTS = Pivots(np.tile(CENTRE, (4, 1)), np.ones(4))
 
 
-def pair(source: int, target: int, deg: float = 20.0, slip: float = 0.0, shape_slip: float = 0.0) -> PairMatch:
-    """Two frames; tones hold them if their shapes slip by more than the pair."""
+def pair(source: int, target: int, deg: float = 20.0, slip: float = 0.0, rivals: tuple[Rival, ...] = ()) -> PairMatch:
+    """Two frames."""
     R = Rotation.from_rotvec([0, np.radians(deg), 0]).as_matrix()
     S = Similarity(1.0, R, CENTRE - R @ CENTRE)
-    return PairMatch(source, target, S, 1e4 * np.eye(7), 0.6, 0.98, 0.01, (), 0.5, slip, AXIS, max(shape_slip, slip))
+    none = Commonness.none(1), Commonness.none(1)
+    return PairMatch(source, target, S, 1e4 * np.eye(7), 0.6, 0.98, 100.0, rivals, 0.5, slip, AXIS, none, (1.0, 1.0))
 
 
 def toned(source: int, target: int, deg: float) -> PairMatch:
-    return pair(source, target, deg, shape_slip=12.0)
+    """Two frames that only their tones hold."""
+    return replace(pair(source, target, deg), by_shape=pair(source, target, deg + 5, slip=12.0))
 
 
 def test_pairs_that_slip_count_only_where_nothing_else_holds_a_frame():
@@ -84,14 +90,42 @@ def test_pairs_that_surfaces_hold_confirm_tones_and_pairs_that_slip_do_not():
     assert with_confirmed_tones([firm], PIVOTS) == [firm]
 
 
-def test_a_pair_without_its_tone_is_as_uncertain_as_its_surfaces_leave_it():
-    """Variances of independent motions add: along the slip it is larger by the slip's square, elsewhere the same."""
-    held = toned(0, 1, 20)
-    free = held.without_tone()
-    before, after = np.linalg.inv(held.information), np.linalg.inv(free.information)
-    np.testing.assert_allclose(after, before + np.radians(12) ** 2 * np.outer(AXIS, AXIS), atol=1e-9)
-    assert free.rotation_sigma_deg == pytest.approx(np.hypot(12, np.degrees(0.01)), rel=1e-6)
-    assert free.slip_deg == 12 and not free.by_tone and held.by_tone
+# The order of capture, of pairs that are said to be registered.
+
+
+def graph_of(monkeypatch: pytest.MonkeyPatch, pairs: list[PairMatch]) -> ViewGraph:
+    """The frames of the ring below with given pairs."""
+    said = {(e.source, e.target): e for e in pairs}
+    monkeypatch.setattr(module, "register_pair", lambda frames, numbers, *_: said[numbers])
+    graph = ViewGraph(SEEN, {}, np.random.default_rng(0))
+    graph.try_pairs(list(said), NEIGHBOURS)
+    return graph
+
+
+def turned(deg: float) -> Similarity:
+    return pair(0, 1, deg).S_target_source
+
+
+def test_the_usual_step_is_that_of_pairs_that_hold(monkeypatch):
+    """The least turn that each allows: a nut is as likely turned by another 60 degrees."""
+    pairs = [pair(k, k + 1, 15.0 + k) for k in range(FRAMES - 1)]
+    pairs[3] = pair(3, 4, -42.0, rivals=(Rival(turned(18.0), -1.0), Rival(turned(2.0), -50.0)))
+    graph = graph_of(monkeypatch, pairs)
+    assert graph.usual_step(0, 1, turned(40.0)) == 0.0  # not known yet
+    graph.learn_step()
+    assert graph.step_deg == pytest.approx(17)
+    odds = [graph.usual_step(i, j, turned(17.0)) for i, j in ((0, 1), (1, 0), (0, 2), (0, 3))]
+    assert odds == pytest.approx([-0.5, -0.5, -0.125, 0.0])
+    assert graph.usual_step(0, 1, turned(77.0)) == pytest.approx(-0.5 * (77 / 17) ** 2)
+    assert graph.usual_step(0, 1, turned(170.0)) == -MOST_BY_ORDER  # someone may have walked to the other side
+
+
+def test_where_most_successive_frames_slip_the_order_says_nothing(monkeypatch):
+    """A vase."""
+    pairs = [pair(k, k + 1, slip=12.0 * (k > 1)) for k in range(FRAMES - 1)]
+    graph = graph_of(monkeypatch, pairs)
+    graph.learn_step()
+    assert graph.step_deg is None and graph.usual_step(0, 1, turned(170.0)) == 0.0
 
 
 # Rough camera poses as a start: baselines, and a common centre.
@@ -99,7 +133,8 @@ def test_a_pair_without_its_tone_is_as_uncertain_as_its_surfaces_leave_it():
 FRAMES = 6
 RIG = rig_of(FRAMES, 60)
 POSES = RIG.T_world_camera.numpy()
-MAPS = [build_surface_map(c) for c in clouds_of(RIG, 60)]
+SEEN = [Frame.of(c) for c in clouds_of(RIG, 60)]
+MAPS = [frame.map for frame in SEEN]
 
 
 @settings(max_examples=20)
