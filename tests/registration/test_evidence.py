@@ -35,6 +35,7 @@ from sl_nerfstudio.registration.pairs import (
     SEARCH_WIDTHS,
     STEP_DEG,
     best_match,
+    is_ambiguous,
     walk,
 )
 from sl_nerfstudio.registration.surfaces import EmptyPlaces
@@ -279,7 +280,6 @@ def test_an_exact_pair_is_refined_to_the_truth(ground, seed):
     places, _ = PairEvidence(source, target).refined(Places.of(start), (*SEARCH_WIDTHS, *FINE_WIDTHS, 3.0, 3.0))
     D = places.similarity(0) @ true.inverse()
     off = D.points(target.centroid[None])[0] - target.centroid
-    print(angle_deg(D.R), np.linalg.norm(off) / target.radius, np.log(D.scale), places.errors)
     assert np.radians(angle_deg(D.R)) < 1e-4 and abs(np.log(D.scale)) < 1e-4
     assert np.linalg.norm(off) < 1e-4 * target.radius
 
@@ -334,7 +334,7 @@ def in_units(frame: FrameEvidence, factor: float) -> FrameEvidence:
     )  # fmt: skip
 
 
-TURNS = (0.0, 4.0, 9.0, -15.0, 40.0)
+TURNS = (0.0, 9.0, -15.0, 40.0)
 
 
 @pytest.mark.parametrize(("bump", "least", "most"), [(0.0, -3.0, 3.0), (0.08, LEAST_ODDS, np.inf)])
@@ -345,7 +345,6 @@ def test_a_surface_of_revolution_says_nothing_about_a_turn_and_a_bump_on_it_does
     places, _ = evidence.refined(Places.of(*(about_axis(views, t) for t in TURNS)), FINE_WIDTHS)
     found = evidence.compare(places)
     leads = evidence.comparison(found, evidence.commonness(found))[0, 1:]
-    print(bump, leads, evidence.log_odds(found, evidence.commonness(found)))
     assert (leads > least).all() and (leads < most).all()
 
 
@@ -358,10 +357,9 @@ def test_a_walk_reaches_the_turn_that_no_slope_leads_to():
     assert angle_deg(start.R[0] @ true.R.T) > 35
     way = walk(evidence, start, H[0])
     off = [angle_deg(way.R[k] @ true.R.T) for k in range(len(way))]
-    print(min(off), max(off), len(way))
     assert min(off) < STEP_DEG
     match = best_match(evidence, way, (0, 1))
-    assert match is not None and match.slip_deg == 0 and match.lead > LEAST_ODDS
+    assert match is not None and match.slip_deg == 0 and not is_ambiguous(match)
     assert angle_deg(match.S_target_source.R @ true.R.T) < 0.5
     alone = best_match(evidence, start, (0, 1))
     assert alone is None or angle_deg(alone.S_target_source.R @ true.R.T) > 35
