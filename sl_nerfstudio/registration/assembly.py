@@ -355,6 +355,8 @@ class Assembly:
 def facing(first: Component, second: Component, S: Similarity, most: int = MOST_PAIRS) -> list[tuple[int, int]]:
     """The pairs of frames across two components whose cameras look most nearly the same way."""
     here, there = list(first), list(second)
+    if not here or not there:
+        return []
     sight = np.array([first[i].R[:, 2] for i in here]), np.array([(S.R @ second[j].R)[:, 2] for j in there])
     cosine = (sight[0][:, None] * sight[1]).sum(-1).ravel()
     near = np.argsort(-cosine, kind="stable")[:most]

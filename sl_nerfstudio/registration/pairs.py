@@ -209,7 +209,7 @@ def register_pair(
     from the same side. `known`: other similarities that are compared as well.
     """
     source, target = frames
-    if not (len(source.evidence.points) and len(target.evidence.points)):
+    if not all(len(frame.evidence.points) and frame.map.valid.any() for frame in frames):
         return None
     found = search_places((source.map, target.map), search, rng, guess)
     starts = Places.joined([Places.of_hypotheses(found), *([Places.of(*known)] if known else [])])
