@@ -24,6 +24,7 @@ from sl_nerfstudio.review.agreement import (
     bridges,
 )
 from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.scan.check_mixed_poses import SUSPECT_SIGMAS
 
 Band = Literal["good", "acceptable", "poor"]
 BANDS: tuple[Band, ...] = ("good", "acceptable", "poor")
@@ -186,6 +187,10 @@ class FrameFacts:
     shared_decoded: float | None = None  # of the surface that other frames show, where this one sees the pattern
     missing_share: float | None = None  # of the surface that other frames show in its sight: where it saw no pattern
     own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's own projector
+    rays_px: float | None = (
+        None  # how far its rays miss each other under a pose that states its uncertainty, pattern px
+    )
+    stated_px: float | None = None  # of this, what the stated uncertainty explains, 1 sigma
     degeneracies: tuple[str, ...] = ()  # why the frame itself determines the pose of its projector only weakly
 
 
@@ -252,6 +257,7 @@ def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
         yield from _weak_connections(facts)
     if facts.cross is not None:
         yield from cross_reasons([f.name for f in facts.in_scan], facts.cross)
+    yield from _starting_poses(facts)
     yield from _decoding(facts)
     yield from _missing(facts)
     degenerate = [f.name for f in facts.in_scan if f.degeneracies]
@@ -389,6 +395,34 @@ def cross_reasons(names: Sequence[str], cross: CrossFrameAgreement) -> Iterator[
             "poor" if cross.share < _LEAST_SHARE else "acceptable",
             f"of all points that two frames saw, {cross.share:.0%} agree: 95 % lie within {cross.px_p95:.2g} px, the "
             f"noise is {cross.noise_px:.2g} px",
+        )
+
+
+def _starting_poses(facts: ScanFacts) -> Iterator[Reason]:
+    """Relative poses that the coordinates of their own frames exclude, by what is stated of them."""
+    known = [(f.rays_px / f.stated_px, f) for f in facts.in_scan if f.rays_px is not None and f.stated_px]
+    if not known:
+        return
+    if _median([excess for excess, _ in known]) > SUSPECT_SIGMAS:
+        rays, stated = (_median([value or 0.0 for value in values]) for values in zip(
+            *((f.rays_px, f.stated_px) for _, f in known), strict=True
+        ))  # fmt: skip
+        yield Reason(
+            "poor",
+            f"the rays of camera and projector miss each other by {rays:.2g} px (median), the stated uncertainty of "
+            f"the poses explains {stated:.2g} px: poses or intrinsics are of another calibration, or sl_pose_sigma is "
+            "too small. Without sl_pose_sigma the training searches farther from these poses; sl-process finds "
+            "poses from the photographs",
+        )
+        return
+    bad = [(excess, f) for excess, f in known if excess > _MOST_SIGMA]
+    if bad:
+        frame = max(bad, key=lambda one: one[0])[1]
+        yield Reason(
+            _share_band(len(bad), len(facts.in_scan)),
+            f"{listed([f.name for _, f in bad])}: the rays of camera and projector miss each other by far more than "
+            f"the stated uncertainty of the poses explains ({frame.name}: {frame.rays_px:.2g} px, stated "
+            f"{frame.stated_px:.2g} px); give these frames another pose of the projector, or leave them out",
         )
 
 
