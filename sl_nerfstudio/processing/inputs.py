@@ -33,6 +33,7 @@ from sl_nerfstudio.processing.captures import (
     incomplete,
     layout_in_order,
     recognise_sequence,
+    require_resolution,
     resolution,
 )
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
@@ -282,6 +283,7 @@ def read_captured(config: ProcessConfig) -> CapturedFrames:
         _refuse_mosaics(captures)
     if layout is None and size is not None:
         layout = recognise_sequence(captures, size, config.sequence, config.cell)
+        require_resolution(captures, layout)
     if layout is None:
         raise ValueError("a pattern is a file or a resolution")
     decoder = decoder or choose_decoder(layout, config.decoder, config.pattern)

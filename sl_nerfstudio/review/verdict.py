@@ -213,6 +213,8 @@ class ScanFacts:
     wrong_intrinsics: bool = False  # the captures contradict the stated intrinsics
     turns_deg: tuple[float, ...] = ()  # after which the surface looks the same, so that frames may be turned by them
     by_order: bool = False  # frames fit at several sides, and the order of capture decided
+    moving_share: float | None = None  # of the decoded pixels: what moves before cameras that stand still
+    moving_registered: bool = False  # only this is in the scan
     adjusted: bool = True  # False: sl-process was told to leave the poses as registration found them
 
     @property
@@ -247,6 +249,8 @@ def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
     if len(facts.in_scan) < 2:
         yield Reason("poor", f"only {len(facts.in_scan)} of {len(facts.frames)} frames could be used")
         return
+    if facts.moving_share is not None:
+        yield _turntable(facts.moving_share, facts.moving_registered)
     yield from _left_out(facts)
     yield from _undecided(facts)
     if facts.by_order:
@@ -270,6 +274,23 @@ def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
         )  # fmt: skip
     if facts.wrong_intrinsics:
         yield Reason("acceptable", "the captures contradict the stated intrinsics")
+
+
+def _turntable(share: float, registered: bool) -> Reason:
+    """Say that what turns was taken before something that stands still."""
+    if registered:
+        return Reason(
+            "acceptable",
+            f"turntable with a static background: only what moves, {share:.0%} of the decoded pixels, is in the scan. "
+            "See in the report that it is all of the object; to be certain, cover the background, or leave it out with "
+            "sl-process --masks",
+        )
+    return Reason(
+        "poor",
+        f"all cameras are in one place while {share:.0%} of the decoded pixels show something that moves: turntable "
+        "with a static background. The scan holds the background, and the object in several positions: leave the "
+        "background out with sl-process --masks, or cover it and capture again",
+    )
 
 
 def _left_out(facts: ScanFacts) -> Iterator[Reason]:
