@@ -229,12 +229,14 @@ def likely_layout(captures: Captures, name: SequenceName) -> GrayCode:
             "give the projector's resolution, as --pattern 1024x768, or the pattern.json of what was projected",
         )
     reached = np.zeros(2)
-    for cells in _cells_of(whole, fitting[-1], 1):
+    for _, cells in _cells_of(whole, fitting[-1], 1):
         reached = np.maximum(reached, _reach(cells))
     return next((layout for layout in fitting if layout.w >= reached[0] and layout.h >= reached[1]), fitting[-1])
 
 
-def _cells_of(frames: Sequence[CapturedFrame], layout: GrayCode, step: int) -> Iterator[Float32[ndarray, "h w 2"]]:
+def _cells_of(
+    frames: Sequence[CapturedFrame], layout: GrayCode, step: int
+) -> Iterator[tuple[CapturedFrame, Float32[ndarray, "h w 2"]]]:
     """Place in cells of every `step`th pixel of the first frames, whatever their bits say; NaN where not decoded."""
     largest = GrayCode(*(2**bits for bits in layout.bits), 1, layout.shown)
     for frame in frames[:_LOOKED_AT]:
@@ -242,7 +244,7 @@ def _cells_of(frames: Sequence[CapturedFrame], layout: GrayCode, step: int) -> I
             images = [np.ascontiguousarray(read_photograph(path)[::step, ::step]) for path in frame.images]
             if check_order(take_samples(images), largest).misplaced:
                 continue
-            yield decode_gray_code(images, largest).coords
+            yield frame, decode_gray_code(images, largest).coords
         except (DecodingError, FileError):
             continue  # said when this frame is read
 
@@ -275,14 +277,14 @@ def require_resolution(captures: Captures, layout: GrayCode) -> None:
     whole = captures.require_whole()
     w, h = captures.size
     stated = np.array([layout.columns, layout.rows])
-    for frame, cells in zip(whole, _cells_of(whole, layout, max(1, max(w, h) // _SIDE)), strict=False):
+    for frame, cells in _cells_of(whole, layout, max(1, max(w, h) // _SIDE)):
         known = cells[np.isfinite(cells).all(-1)]
         beyond = (known > stated + 0.5).mean(0) > _IMPOSSIBLE
         centred = (2 ** np.array(layout.bits) - stated) / 2  # by programs that count from the middle
         low = np.quantile(known, _BEYOND, axis=0)
         beyond &= ~((low > centred - 1) & (known < centred + stated + 1).all(0)) | (centred == 0)
         edge = np.array([_edge(known, axis) for axis in (0, 1)])
-        missing = edge < stated - 1.5
+        missing = edge < (1 - _NEAR) * stated - 1.5
         if not beyond.any() and not missing.all():
             continue
         reach = np.where(np.isfinite(edge), edge, np.ceil(_reach(cells))).astype(int)
