@@ -45,6 +45,7 @@ from sl_nerfstudio.calibration.board_adjustment import (
     sightings,
 )
 from sl_nerfstudio.geometry.devices import DEVICE_FIELDS, PARAMETERS, Device, DeviceKind, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
 from sl_nerfstudio.pattern.boards import Board, Chessboard
 
 # The choice of the model.
@@ -208,6 +209,48 @@ def formal_sigmas(free: Free, information: Float64[ndarray, "s s"]) -> list[Floa
     return out
 
 
+# Whether the lens is what its model says: corners that lie nearer to the middle of the image, or farther, than they
+# should, by how far out they are. A polynomial that is too short for a lens alternates between the two.
+
+_RINGS, _FEWEST_IN_RING = 8, 12
+_RING_CHI_SQUARE = 60.0  # of all rings together, by chance about as much as there are rings
+_RING_SHARE = 0.25  # of the corners' noise: less matters to nothing
+
+
+@dataclass(frozen=True)
+class RadialMisfit:
+    """How far corners lie outside of where the lens puts them, in the rings where that is largest; pixels."""
+
+    inwards_px: float  # not positive
+    outwards_px: float  # not negative
+
+
+def radial_misfit(
+    device: Device, uv: Float64[ndarray, "n 2"], residual: Float64[ndarray, "n 2"]
+) -> RadialMisfit | None:
+    """What is left along the radius, in rings about the principal point; None where it is chance, or below the noise.
+
+    `residual` is seen minus predicted.
+    """
+    out = uv - (device.cx, device.cy)
+    radius = np.linalg.norm(out, axis=1)
+    along = (residual * out).sum(1) / radius.clip(1e-9)
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(residual - np.median(residual, 0))))
+    rings = np.array_split(np.argsort(radius), min(_RINGS, len(radius) // _FEWEST_IN_RING)) if len(radius) else []
+    median = np.array([np.median(along[ring]) for ring in rings])
+    spread = np.array(
+        [MAD_TO_SIGMA * np.median(np.abs(along[ring] - m)) for ring, m in zip(rings, median, strict=True)]
+    )
+    sigma = _OF_MEDIAN * spread / np.sqrt([len(ring) for ring in rings])
+    chi_square = float(((median / sigma.clip(1e-9)) ** 2).sum())
+    if chi_square < _RING_CHI_SQUARE or np.abs(median).max() < _RING_SHARE * noise:
+        return None
+    return RadialMisfit(float(min(median.min(), 0.0)), float(max(median.max(), 0.0)))
+
+
+_OF_MEDIAN = 1.2533  # sigma of a median over that of a mean, of normal errors
+
+
 # How varied the views are, and which further pose of the board would help most.
 
 _GRID = (8, 6)  # cells of the image that corners are counted in
@@ -337,6 +380,7 @@ class BoardCalibration:
     models: tuple[ModelScore, ...]
     coverage: Coverage
     next_pose: NextPose | None
+    misfit: tuple[RadialMisfit | None, ...]  # of each device's lens
 
     @property
     def camera(self) -> Device:
@@ -386,6 +430,10 @@ def calibrate(
         models,
         coverage_of(adjusted, views),
         next_pose(adjusted, p_board),
+        tuple(
+            radial_misfit(device, one.uv, r)
+            for device, one, r in zip(adjusted.rig.devices, seen, all_residuals, strict=True)
+        ),
     )
 
 

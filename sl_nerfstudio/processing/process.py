@@ -337,7 +337,8 @@ def _register_what_moves(
         f"all cameras are in one place, and {part.share:.0%} of the decoded pixels show something that moves: "
         f"turntable with a static background. Registering what moves alone; masks of it: {frames.job.work / MASKS}"
     )
-    alone = only_moving(frames, part)
+    rigid = part.rigid and config.rig == "free" and not config.no_adjust
+    config, alone = replace(config, rig="rigid") if rigid else config, only_moving(frames, part, rigid)
     if len(clouds_of(alone.results)) >= FEWEST_FRAMES:
         alone, registration = _register(config, inputs, alone, _given(inputs, alone.results), log)
         if registration.registered.sum() >= FEWEST_FRAMES:

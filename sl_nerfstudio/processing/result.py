@@ -13,6 +13,7 @@ from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.calibration.stated import describe_change
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
+from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frames import FrameStageResult, clouds_of
 from sl_nerfstudio.processing.inputs import CaptureNotes
@@ -31,9 +32,10 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
     UndecidedProjector,
 )
+from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind
 from sl_nerfstudio.review.agreement import CrossFrameAgreement, SurfaceShares
-from sl_nerfstudio.review.moving_part import MovingPart
+from sl_nerfstudio.review.moving_part import MovingPart, in_one_place
 from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, ScanFacts, Verdict, judge_scan, listed
 
 # Sentences for what relative pose estimation and registration found out about frames.
@@ -424,9 +426,19 @@ def _with_others(
 def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames | None) -> str:
     """Which intrinsics the captures contradict; "" if none."""
     clouds = clouds_of(results)
-    if adjusted is None or not clouds:
+    if adjusted is None or not clouds or repeat_each_other(adjusted.poses, clouds):
         return ""
     return contradiction(adjusted.intrinsics, [cloud.camera for cloud in clouds], clouds[0].projector)
+
+
+def repeat_each_other(poses: DevicePoses, clouds: Sequence[FrameCloud]) -> bool:
+    """Whether both devices stood still in all frames: their errors repeat, and say nothing more than those of one."""
+    placed = np.isfinite(poses.T_world_camera).all((1, 2))
+    chosen = poses[placed]
+    depths = [-float(np.median(cloud.points[:, 2])) for cloud in clouds]
+    depth = float(np.median(depths)) * float(np.median(chosen.baseline)) if len(chosen) else 0.0
+    projectors = DevicePoses(chosen.T_world_projector, chosen.T_world_camera)
+    return in_one_place(chosen, depth) and in_one_place(projectors, depth)
 
 
 def _both_known(before: float, after: float) -> tuple[float, float] | None:

@@ -11,7 +11,7 @@ from numpy import ndarray
 from sl_nerfstudio.processing.consistency import ConsistentFrames
 from sl_nerfstudio.processing.frames import FrameStageResult, clouds_of, with_kept_cloud
 from sl_nerfstudio.processing.masks import find_masks
-from sl_nerfstudio.processing.projector import CalibratedFrames
+from sl_nerfstudio.processing.projector import CalibratedFrames, with_one_pose
 from sl_nerfstudio.processing.records import LargeClouds
 from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError
@@ -32,19 +32,19 @@ def moving_part(results: Sequence[FrameStageResult], consistent: ConsistentFrame
     )
 
 
-def only_moving(frames: CalibratedFrames, part: MovingPart) -> CalibratedFrames:
+def only_moving(frames: CalibratedFrames, part: MovingPart, rigid: bool) -> CalibratedFrames:
     """The frames with what moves alone; their relative poses stay those of the whole picture.
 
-    The masks are written to the work folder, for `--masks` once they are corrected. Frames in which hardly anything
-    moves are left out.
+    `rigid`: all get one. The masks are written to the work folder, for `--masks` once they are corrected. Frames in
+    which hardly anything moves are left out. Raises UserError if no pose fits all frames.
     """
-    folder, kept, clouds = frames.job.work / MASKS, LargeClouds(), iter(part.masks)
-    results, sizes = [], {}
-    for result in frames.results:
+    folder, kept, sizes = frames.job.work / MASKS, LargeClouds(), {}
+    shown = [result for result in frames.results if result.cloud is not None]
+    results = [result for result in frames.results if result.cloud is None]
+    for result, mask in zip(with_one_pose(frames.job, shown) if rigid else shown, part.masks, strict=True):
         if result.cloud is None:
             results.append(result)
             continue
-        mask = next(clouds)
         try:
             result = with_kept_cloud(replace(result, cloud=_masked(result.cloud, mask)), kept)
         except RelativePoseError:
@@ -54,7 +54,10 @@ def only_moving(frames: CalibratedFrames, part: MovingPart) -> CalibratedFrames:
         sizes[result.name] = mask.shape[1], mask.shape[0]
         results.append(result)
     masks = find_masks(folder, sizes) if sizes else frames.job.masks
-    return replace(frames, job=replace(frames.job, masks=masks), results=results)
+    by_name = {result.name: result for result in results}
+    return replace(
+        frames, job=replace(frames.job, masks=masks), results=[by_name[result.name] for result in frames.results]
+    )
 
 
 _NOTHING_MOVES = (
@@ -76,7 +79,7 @@ def _masked(cloud: FrameCloud, mask: Bool[ndarray, "h w"]) -> FrameCloud:
     inside = mask[row, column]
     coords = np.where(mask[..., None], cloud.coords, np.float32(np.nan))
     noise = cloud.pose.noise_px[cloud.pose.inliers][inside]
-    pose = replace(cloud.pose, inliers=np.ones(len(noise), bool), noise_px=noise)
+    pose = replace(cloud.pose, inliers=np.ones(len(noise), bool), noise_px=noise, alternatives=())
     return frame_cloud(cloud.name, coords, cloud.camera, cloud.projector, pose, light=cloud.light, seen=cloud.seen)
 
 

@@ -44,6 +44,7 @@ class MovingPart:
 
     masks: tuple[Bool[ndarray, "_h _w"], ...]  # of every frame: the pixels that show it
     share: float  # of the decoded pixels: the median over the frames
+    rigid: bool  # the projector stood still, too
     registered: bool = False  # the frames are where this puts them, and not where the background does
 
 
@@ -74,25 +75,28 @@ def find_moving_part(
     T = poses.T_camera_projector
     placed = np.isfinite(T).all((1, 2))
     T = np.where(placed[:, None, None], T, T[np.argmax(placed)])
-    thin, points, depth = [], [], 0.0
-    for camera, T_camera_projector, image in zip(cameras, T, coords, strict=True):
-        thin.append(np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step]))
-        points.append(_points(camera, T_camera_projector, thin[-1], projector, step))
-        if len(points) == 1:
-            seen = -points[0][..., 2][np.isfinite(points[0][..., 2])]
-            depth = float(np.median(seen)) if len(seen) else 0.0
-            if not in_one_place(poses, depth):
-                return None  # without reading the others
+    every = iter(coords)
+    thin = [np.ascontiguousarray(next(every)[step // 2 :: step, step // 2 :: step])]
+    depth = _median(-_points(cameras[0], T[0], thin[0], projector, step)[..., 2])
+    if not in_one_place(poses, depth):
+        return None  # without reading the others
+    thin += [np.ascontiguousarray(image[step // 2 :: step, step // 2 :: step]) for image in every]
+    tolerance = [_tolerance(*each, projector, depth) for each in zip(cameras, sigma, strict=True)]
+    apart = [_median(np.linalg.norm(thin[0] - image, axis=-1)) for image in thin]
+    rigid = bool(np.median(apart[1:]) < _tolerance(cameras[0], None, projector, depth))
+    if rigid:
+        T = np.tile(T[np.argmax(placed)], (len(T), 1, 1))
+        tolerance = [_tolerance(camera, None, projector, depth) for camera in cameras]
+    points = [_points(*each, projector, step) for each in zip(cameras, T, thin, strict=True)]
     depths = [-p[..., 2] for p in points]
     some = evenly_spaced(len(thin), min(_COMPARED, len(thin))).tolist()
-    tolerance = [_tolerance(*each, projector, depth) for each in zip(cameras, sigma, strict=True)]
 
     def agree(k: int, j: int) -> Bool[ndarray, "h w"]:
         apart = _residual(points[k], projector, T[j], thin[j])
-        noise = _SIGMAS * float(np.nanmedian(apart)) if np.isfinite(apart).any() else 0.0
-        return apart < np.clip(noise, _LEAST_TOLERANCE, max(tolerance[k], tolerance[j]))
+        return apart < np.clip(_SIGMAS * _median(apart), _LEAST_TOLERANCE, max(tolerance[k], tolerance[j]))
 
-    # Whatever moves is before what stands still: at each pixel, the farthest that two frames show.
+    # Whatever moves is before what stands still: at each pixel, the farthest that two frames show; if no two show the
+    # same, nothing there stands still.
     farthest, reference = np.full(thin[0].shape[:2], -np.inf), np.full(thin[0].shape[:2], -1)
     for k in some:
         shown = np.isfinite(depths[k])
@@ -104,9 +108,9 @@ def find_moving_part(
     for k, image in enumerate(thin):
         decoded, before = np.isfinite(image[..., 0]), depths[k] < farthest
         before &= ~np.any([(reference == j) & agree(k, j) for j in some], 0)
-        compared = decoded & (reference >= 0)
-        still, judged = still + int((compared & ~before).sum()), judged + int(compared.sum())
-        found.append(_patches(decoded, before | (reference < 0), compared))
+        moves, compared = before | (reference < 0), decoded & (sum(np.isfinite(depths[j]) for j in some if j != k) > 0)
+        still, judged = still + int((compared & ~moves).sum()), judged + int(compared.sum())
+        found.append(_patches(decoded, moves, compared))
     shares = [
         float(mask.sum() / max(1, np.isfinite(image[..., 0]).sum())) for mask, image in zip(found, thin, strict=True)
     ]
@@ -114,7 +118,12 @@ def find_moving_part(
         return None
     size = cameras[0].w, cameras[0].h
     masks = tuple(cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0 for mask in found)
-    return MovingPart(masks, float(np.median(shares)))
+    return MovingPart(masks, float(np.median(shares)), rigid)
+
+
+def _median(values: Float64[ndarray, "*at"] | Float32[ndarray, "*at"]) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else 0.0
 
 
 def in_one_place(poses: DevicePoses, depth: float) -> bool:

@@ -159,6 +159,16 @@ def _reasons(found: BoardCalibration) -> Iterator[Reason]:
             )
         if (band := _band(found.rms_px[k], _RMS_PX)) != "good":
             yield Reason(band, f"corners are {found.rms_px[k]:.2f} px (RMS) from where the {name} should see them")
+        misfit = found.misfit[k]
+        if misfit is not None:
+            yield Reason(
+                "acceptable",
+                f"the model of the {name}'s lens does not fit: corners lie up to {-misfit.inwards_px:.2g} px inside "
+                f"and {misfit.outwards_px:.2g} px outside of where it puts them, depending on how far they are from the "
+                "middle of the image. Its focal length may be wrong by more than stated: wide-angle and fisheye lenses "
+                "are not modelled beyond k1, k2; use a longer lens, or only the middle of the image (crop photographs "
+                "and captures alike)",
+            )
         if found.left_out.error_px[k] > _GOOD_PREDICTION * max(found.rms_px[k], found.adjusted.sigma_px[k]):
             yield Reason(
                 "acceptable",

@@ -4,11 +4,18 @@ import json
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
 from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.processing import process as processing
+from sl_nerfstudio.processing.captures import find_captures
+from sl_nerfstudio.processing.frames import FrameWorker, clouds_of
 from sl_nerfstudio.processing.process import process
+from sl_nerfstudio.processing.projector import contradiction_by_epipolar_geometry
+from sl_nerfstudio.relative_pose.epipolar import correspondences_of
+from sl_nerfstudio.relative_pose.intrinsics import check_intrinsics
+from sl_nerfstudio.relative_pose.joint_fit import FrameMatches
 from sl_nerfstudio.review.moving_part import moving_share
 from sl_nerfstudio.scan import check_scan, read_scan
 from tests.processing.conftest import register_ramps
@@ -61,3 +68,17 @@ def test_a_camera_that_stands_still_before_what_does_is_left_alone(tmp_path, ram
     result = process(still.config(tmp_path / "s"), render_processing_report, lambda _: None)
     assert moving_share(read_scan(tmp_path / "s")) is None
     assert not any("turntable" in reason for reason in result.verdict.reasons)
+
+
+def test_errors_that_repeat_in_every_frame_do_not_contradict_the_intrinsics(tmp_path, ramps_registered):
+    """The same errors in ten frames of one place are those of one frame; the intrinsics are exact."""
+    rng = np.random.default_rng(0)
+    shared = 0.35 * np.stack([gaussian_filter(rng.normal(size=(240, 240)), 12) * 30 for _ in range(2)], -1)
+    still = make_turntable_scan(tmp_path / "c", frames=8, step_deg=0.0, errors_px=shared).scan
+    job = still.job(tmp_path / "work")
+    results = [FrameWorker(job)(frame) for frame in find_captures(still.root / "images", True).frames]
+    assert all(result.cloud is not None for result in results)
+    assert contradiction_by_epipolar_geometry(job, results) == ""
+    frames = [FrameMatches(c.name, *correspondences_of(c.coords), c.camera) for c in clouds_of(results)]
+    poses = [(c.pose.T_camera_projector[:3, :3], c.pose.T_camera_projector[:3, 3]) for c in clouds_of(results)]
+    assert check_intrinsics(frames, poses, job.projector).contradicts()  # where each frame counts by itself

@@ -24,8 +24,17 @@ class TurntableScan:
     turns_deg: tuple[float, ...]  # of the object
 
 
-def make_turntable_scan(root: Path, frames: int = 6, step_deg: float = STEP_DEG, moving_projector: bool = False):
-    """Captures of frames in which the object is turned by `step_deg` more each; 0: nothing moves."""
+def make_turntable_scan(
+    root: Path,
+    frames: int = 6,
+    step_deg: float = STEP_DEG,
+    moving_projector: bool = False,
+    errors_px: np.ndarray | float = 0.0,
+) -> TurntableScan:
+    """Captures of frames in which the object is turned by `step_deg` more each; 0: nothing moves.
+
+    `errors_px` are added to the coordinates of every frame alike.
+    """
     setup = make_setup(SynthConfig(scene="head", frames=frames, resolution=240, path="rigid-rig", seed=0))
     setup = replace(setup, devices=DevicePair(*(_wider(d) for d in (setup.devices.camera, setup.devices.projector))))
     scene, room = setup.scene, _room(setup.scene)
@@ -44,7 +53,7 @@ def make_turntable_scan(root: Path, frames: int = 6, step_deg: float = STEP_DEG,
         seen = visible_centres(FrameGeometry(caster, setup.devices, T_camera, T_projector))
         size = setup.devices.camera.h, setup.devices.camera.w
         uv = np.where(seen.lit[:, None], seen.uv_projector, np.nan).reshape(*size, 2)
-        coords.append(uv.astype(np.float32))
+        coords.append((uv + errors_px).astype(np.float32))
         is_object.append((caster.on_object(seen.face) & seen.lit).reshape(size))
         turns.append(step_deg * k)
     names = tuple(f"f{k}" for k in range(frames))
