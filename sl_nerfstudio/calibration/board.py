@@ -213,7 +213,7 @@ def formal_sigmas(free: Free, information: Float64[ndarray, "s s"]) -> list[Floa
 # should, by how far out they are. A polynomial that is too short for a lens alternates between the two.
 
 _RINGS, _FEWEST_IN_RING = 8, 12
-_RING_CHI_SQUARE = 60.0  # of all rings together, by chance about as much as there are rings
+_RING_CHI_SQUARE = 30.0  # of all rings together; about as much as there are rings if the model is right
 _RING_SHARE = 0.25  # of the corners' noise: less matters to nothing
 
 

@@ -163,11 +163,11 @@ def _reasons(found: BoardCalibration) -> Iterator[Reason]:
         if misfit is not None:
             yield Reason(
                 "acceptable",
-                f"the model of the {name}'s lens does not fit: corners lie up to {-misfit.inwards_px:.2g} px inside "
-                f"and {misfit.outwards_px:.2g} px outside of where it puts them, depending on how far they are from the "
-                "middle of the image. Its focal length may be wrong by more than stated: wide-angle and fisheye lenses "
-                "are not modelled beyond k1, k2; use a longer lens, or only the middle of the image (crop photographs "
-                "and captures alike)",
+                f"the model of the {name}'s lens does not fit: with their distance from the middle of the image, "
+                f"corners lie up to {-misfit.inwards_px:.2g} px inside and {misfit.outwards_px:.2g} px outside of "
+                "where it puts them. The focal length may be wrong by more than its sigma. Wide-angle and fisheye "
+                "lenses have no model beyond k1, k2: use a longer lens, or crop photographs and captures alike to the "
+                "middle",
             )
         if found.left_out.error_px[k] > _GOOD_PREDICTION * max(found.rms_px[k], found.adjusted.sigma_px[k]):
             yield Reason(
