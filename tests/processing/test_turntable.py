@@ -8,9 +8,11 @@ from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
 from sl_nerfstudio.geometry.lie import angle_deg
+from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.processing import process as processing
 from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.frames import FrameWorker, clouds_of
+from sl_nerfstudio.processing.object_only import FrameShares, ObjectOnly
 from sl_nerfstudio.processing.process import process
 from sl_nerfstudio.processing.projector import contradiction_by_epipolar_geometry
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of
@@ -82,3 +84,23 @@ def test_errors_that_repeat_in_every_frame_do_not_contradict_the_intrinsics(tmp_
     frames = [FrameMatches(c.name, *correspondences_of(c.coords), c.camera) for c in clouds_of(results)]
     poses = [(c.pose.T_camera_projector[:3, :3], c.pose.T_camera_projector[:3, 3]) for c in clouds_of(results)]
     assert check_intrinsics(frames, poses, job.projector).contradicts()  # where each frame counts by itself
+
+
+def test_object_only_is_judged_by_what_it_keeps(turntable, tmp_path, ramps_registered, monkeypatch):
+    """The wall agrees; the object, which turned before it, does not."""
+    monkeypatch.setattr(processing, "moving_part", lambda *_: None)
+    monkeypatch.setattr(processing, "find_object_only", lambda *_: objects(turntable))
+    result = process(turntable.scan.config(tmp_path / "s", object_only=True), render_processing_report, lambda _: None)
+    assert result.verdict.band == "poor"
+    assert any("contradict" in reason or "agree" in reason for reason in result.verdict.reasons)
+    assert result.cross_px[0] > 0.5
+
+
+def objects(turntable):
+    """Exactly the object, in every frame."""
+    parts = {
+        f"f{k}": np.where(is_object, Part.OBJECT, Part.PLANE).astype(np.uint8)
+        for k, is_object in enumerate(turntable.is_object)
+    }
+    shares = tuple(FrameShares(name, 0.1, 0.9, 0.0) for name in parts)
+    return ObjectOnly((), (), shares, parts)
