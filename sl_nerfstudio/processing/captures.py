@@ -238,7 +238,8 @@ def _cells_of(
     frames: Sequence[CapturedFrame], layout: GrayCode, step: int
 ) -> Iterator[tuple[CapturedFrame, Float32[ndarray, "h w 2"]]]:
     """Place in cells of every `step`th pixel of the first frames, whatever their bits say; NaN where not decoded."""
-    largest = GrayCode(*(2**bits for bits in layout.bits), 1, layout.shown)
+    columns, rows = (2**bits for bits in layout.bits)
+    largest = GrayCode(columns, rows, 1, layout.shown)
     for frame in frames[:_LOOKED_AT]:
         try:
             images = [np.ascontiguousarray(read_photograph(path)[::step, ::step]) for path in frame.images]

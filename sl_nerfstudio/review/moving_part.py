@@ -176,7 +176,9 @@ def _patches(
     """Decoded pixels in patches that move: most neighbours do, most of a patch was compared, and it is not tiny."""
     around = np.asarray(uniform_filter(decoded.astype(np.float32), _PATCH))
     moving = np.asarray(uniform_filter((decoded & moves).astype(np.float32), _PATCH))
-    patch, count = label(binary_fill_holes(moving > np.maximum(around / 2, _PATCH**-2)))
+    patch = np.zeros(decoded.shape, np.int32)
+    label(binary_fill_holes(moving > np.maximum(around / 2, _PATCH**-2)), output=patch)
+    count = int(patch.max(initial=0))
     if not count:
         return np.zeros_like(decoded)
     index = np.arange(1, count + 1)

@@ -57,15 +57,16 @@ def copied_poses(frames: Sequence[Correspondences], given: GeometricFit, focal: 
     A device that stands still has one pose as well: then it fits.
     """
     bad = suspect_frames(given, focal)
-    if len(frames) < 3 or bad.mean() < 0.5:
+    if len(frames) < 3 or bad.mean() < 0.5 or bad.all():  # it fits the frame that it was copied from
         return None
     T = DevicePoses(np.stack([f.T_world_camera for f in frames]), np.stack([f.T_world_projector for f in frames]))
     length = max(float(np.median(T.baseline)), 1e-300)
     camera, projector = _same(T.T_world_camera, length), _same(T.T_world_projector, length)
     relative = _same(T.T_camera_projector, length)
     fits = f"it fits the coordinates of {int((~bad).sum())} of {len(frames)} frames"
-    for kind, mine in (("camera", camera), ("projector", projector)):
-        if len(mine) > len(frames) / 2 and not (camera.size > len(frames) / 2 and kind == "projector"):
+    both: tuple[tuple[Kind, ndarray], ...] = (("camera", camera), ("projector", projector))
+    for kind, mine in both:
+        if len(mine) > len(frames) / 2:
             first, others = frames[mine[0]].name, len(mine) - 1
             return _KEYS[kind], Problem(
                 f"is the same in {len(mine)} of {len(frames)} frames, and {fits}; rays miss each other by "
@@ -74,7 +75,7 @@ def copied_poses(frames: Sequence[Correspondences], given: GeometricFit, focal: 
                 f"give each frame its own pose of the {kind}; where none is known, make the scan from the photographs: "
                 "sl-process finds both poses of every frame",
             )
-    if len(relative) > len(frames) / 2 and not bad.all():
+    if len(relative) > len(frames) / 2:
         return _KEYS["projector"], Problem(
             f"lies in the same place relative to the camera in {len(relative)} of {len(frames)} frames, and {fits}; "
             f"rays miss each other by {given.typical_px:.0f} px",
