@@ -212,8 +212,9 @@ def formal_sigmas(free: Free, information: Float64[ndarray, "s s"]) -> list[Floa
 # Whether the lens is what its model says: corners that lie nearer to the middle of the image, or farther, than they
 # should, by how far out they are. A polynomial that is too short for a lens alternates between the two.
 
-_RINGS, _FEWEST_IN_RING = 8, 12
-_RING_CHI_SQUARE = 30.0  # of all rings together; about as much as there are rings if the model is right
+_RINGS, _FEWEST_VIEWS, _FEWEST_OF_VIEW = 8, 3, 3
+_RING_CHI_SQUARE = 25.0  # of all rings together; about as much as there are rings if the model is right
+_WIDE = 0.6  # radius of the outermost corners in focal lengths, 31 degrees: narrower lenses have no such terms
 _RING_SHARE = 0.25  # of the corners' noise: less matters to nothing
 
 
@@ -225,30 +226,27 @@ class RadialMisfit:
     outwards_px: float  # not negative
 
 
-def radial_misfit(
-    device: Device, uv: Float64[ndarray, "n 2"], residual: Float64[ndarray, "n 2"]
-) -> RadialMisfit | None:
-    """What is left along the radius, in rings about the principal point; None where it is chance, or below the noise.
+def radial_misfit(device: Device, seen: CornerSightings, residual: Float64[ndarray, "n 2"]) -> RadialMisfit | None:
+    """What is left along the radius of a wide lens, in rings; None where it is chance, or below the noise.
 
-    `residual` is seen minus predicted.
+    `residual` is seen minus predicted. Corners of a view share errors, so a ring is as certain as its views agree.
     """
-    out = uv - (device.cx, device.cy)
+    out = seen.uv - (device.cx, device.cy)
     radius = np.linalg.norm(out, axis=1)
     along = (residual * out).sum(1) / radius.clip(1e-9)
     noise = MAD_TO_SIGMA * float(np.median(np.abs(residual - np.median(residual, 0))))
-    rings = np.array_split(np.argsort(radius), min(_RINGS, len(radius) // _FEWEST_IN_RING)) if len(radius) else []
-    median = np.array([np.median(along[ring]) for ring in rings])
-    spread = np.array(
-        [MAD_TO_SIGMA * np.median(np.abs(along[ring] - m)) for ring, m in zip(rings, median, strict=True)]
-    )
-    sigma = _OF_MEDIAN * spread / np.sqrt([len(ring) for ring in rings])
-    chi_square = float(((median / sigma.clip(1e-9)) ** 2).sum())
-    if chi_square < _RING_CHI_SQUARE or np.abs(median).max() < _RING_SHARE * noise:
+    middles, chi_square = [0.0], 0.0
+    for ring in np.array_split(np.argsort(radius), _RINGS):
+        of_view = [along[ring][seen.view[ring] == k] for k in np.unique(seen.view[ring])]
+        medians = np.array([np.median(values) for values in of_view if len(values) >= _FEWEST_OF_VIEW])
+        if len(medians) >= _FEWEST_VIEWS:
+            middles.append(float(np.median(medians)))
+            sigma = max(float(medians.std(ddof=1)), _RING_SHARE * noise) / np.sqrt(len(medians))
+            chi_square += float(medians.mean() / sigma) ** 2
+    wide = float(np.quantile(radius, 0.98)) > _WIDE * device.fl_x
+    if not wide or chi_square < _RING_CHI_SQUARE or max(map(abs, middles)) < _RING_SHARE * noise:
         return None
-    return RadialMisfit(float(min(median.min(), 0.0)), float(max(median.max(), 0.0)))
-
-
-_OF_MEDIAN = 1.2533  # sigma of a median over that of a mean, of normal errors
+    return RadialMisfit(min(middles), max(middles))
 
 
 # How varied the views are, and which further pose of the board would help most.
@@ -431,7 +429,7 @@ def calibrate(
         coverage_of(adjusted, views),
         next_pose(adjusted, p_board),
         tuple(
-            radial_misfit(device, one.uv, r)
+            radial_misfit(device, one, r)
             for device, one, r in zip(adjusted.rig.devices, seen, all_residuals, strict=True)
         ),
     )

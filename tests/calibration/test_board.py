@@ -79,7 +79,7 @@ def test_a_lens_that_is_none_of_the_models_is_no_good_calibration(seed):
     ):
         seen = scene.seen
         adjusted = adjust(camera_start(scene.views, scene.sizes[0], POINTS).rig, (FreeIntrinsics(False, 2),), seen)
-        found = radial_misfit(adjusted.rig.camera, seen[0].uv, residuals(adjusted.rig, 0, seen[0]))
+        found = radial_misfit(adjusted.rig.camera, seen[0], residuals(adjusted.rig, 0, seen[0]))
         assert (found is None) == fits
 
 
