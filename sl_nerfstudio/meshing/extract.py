@@ -330,8 +330,8 @@ def _no_surface(grid: SparseGrid) -> str:
     sign = "positive" if float(grid.values(centre, "centre")[0]) > 0 else "negative"
     return (
         f"the field has no zero level in the box: it is {sign} everywhere, so there is no surface to export. "
-        "The training has probably not begun to converge, or the scan's poses do not fit together: train on with "
-        "ns-train --load-dir, or find the poses anew from the photographs, with sl-process."
+        "The training has probably not begun to converge, or the scan's poses do not fit together: "
+        "look at the run in ns-viewer, train longer, and check the scan with sl-check."
     )
 
 
