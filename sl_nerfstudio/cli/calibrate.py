@@ -170,13 +170,7 @@ def _content(config: CalibrateConfig) -> list[Any]:
 def _decoder(config: CalibrateConfig, found: "Captures") -> "Decoder[Any]":
     """Choose the decoder of the pattern that was projected."""
     from sl_nerfstudio.decoding.decoders import choose_decoder
-    from sl_nerfstudio.processing.captures import (
-        layout_in_order,
-        likely_layout,
-        recognise_sequence,
-        require_resolution,
-        resolution,
-    )
+    from sl_nerfstudio.processing.captures import layout_in_order, likely_layout, recognise_sequence, resolution
 
     if config.pattern is None:
         layout = likely_layout(found, config.sequence or "opencv")
@@ -186,9 +180,7 @@ def _decoder(config: CalibrateConfig, found: "Captures") -> "Decoder[Any]":
         return choose_decoder(layout, None, config.images)
     size = resolution(config.pattern)
     if size is not None:
-        recognised = recognise_sequence(found, size, config.sequence, None)
-        require_resolution(found, recognised)
-        return choose_decoder(recognised, None, config.pattern)
+        return choose_decoder(recognise_sequence(found, size, config.sequence, None), None, config.pattern)
     return choose_decoder(layout_in_order(config.pattern, config.sequence), None, config.pattern)
 
 

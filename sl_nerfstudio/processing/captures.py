@@ -266,7 +266,7 @@ _NEAR = 0.03  # distance of an edge from where a resolution has it, as a share: 
 _MOST_LIKELY = 3  # resolutions that are named
 
 
-def require_resolution(captures: Captures, layout: GrayCode) -> None:
+def _require_resolution(captures: Captures, layout: GrayCode) -> None:
     """Raise FileError if the captures show that the projector has another resolution than that of `layout`.
 
     Cells beyond the stated ones cannot be. Cells that are missing tell where the edge of the pattern is seen: all rows
@@ -404,7 +404,7 @@ def recognise_sequence(
     """The sequence that the captures show, for a projector of `size`; frames with faults are not looked at.
 
     Sequences that differ only where no image could tell are one. Raises UserError with the frame's folder if its images
-    fit no known sequence, or more than one, and if two frames show different ones.
+    fit no known sequence, or more than one, if two frames show different ones, and if the projector has another size.
     """
     whole = captures.require_whole()
     found: dict[GrayCode, Path] = {}

@@ -33,7 +33,6 @@ from sl_nerfstudio.processing.captures import (
     incomplete,
     layout_in_order,
     recognise_sequence,
-    require_resolution,
     resolution,
 )
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
@@ -283,7 +282,6 @@ def read_captured(config: ProcessConfig) -> CapturedFrames:
         _refuse_mosaics(captures)
     if layout is None and size is not None:
         layout = recognise_sequence(captures, size, config.sequence, config.cell)
-        require_resolution(captures, layout)
     if layout is None:
         raise ValueError("a pattern is a file or a resolution")
     decoder = decoder or choose_decoder(layout, config.decoder, config.pattern)
