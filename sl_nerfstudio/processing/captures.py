@@ -430,4 +430,6 @@ def recognise_sequence(
             f"{second.cell})\n    cause:  the folders hold captures of several sequences\n"
             "    remedy: process them separately, or name the sequence with --sequence"
         )
-    return next(iter(found))
+    layout = next(iter(found))
+    _require_resolution(captures, layout)
+    return layout
