@@ -98,9 +98,9 @@ def other_axes(surface: IndexedMesh, points: Float64[ndarray, "n 3"]) -> str:
     now = float(np.median(surface.distance(some)))
     if now < _OFF * surface.diagonal:
         return ""
-    tried = [(float(np.median(surface.distance(some @ R * unit))) / unit, words) for R, unit, words in _axes()]
+    tried = [(float(np.median(surface.distance(some @ R * unit))), words) for R, unit, words in _axes()]
     best, words = min(tried)
-    return words if best < _EXPLAINS * now else ""
+    return words if best < min(_EXPLAINS * now, _OFF * surface.diagonal) else ""
 
 
 def _axes() -> Iterator[tuple[Float64[ndarray, "3 3"], float, str]]:

@@ -159,22 +159,20 @@ def _reasons(found: BoardCalibration) -> Iterator[Reason]:
             )
         if (band := _band(found.rms_px[k], _RMS_PX)) != "good":
             yield Reason(band, f"corners are {found.rms_px[k]:.2f} px (RMS) from where the {name} should see them")
-        misfit = found.misfit[k]
-        if misfit is not None:
-            yield Reason(
-                "acceptable",
-                f"the model of the {name}'s lens does not fit: with their distance from the middle of the image, "
-                f"corners lie up to {-misfit.inwards_px:.2g} px inside and {misfit.outwards_px:.2g} px outside of "
-                "where it puts them. The focal length may be wrong by more than its sigma. Wide-angle and fisheye "
-                "lenses have no model beyond k1, k2: use a longer lens, or crop photographs and captures alike to the "
-                "middle",
-            )
         if found.left_out.error_px[k] > _GOOD_PREDICTION * max(found.rms_px[k], found.adjusted.sigma_px[k]):
             yield Reason(
                 "acceptable",
                 f"corners of left-out poses are predicted to {found.left_out.error_px[k]:.2f} px in the {name}, "
                 f"fitted ones to {found.rms_px[k]:.2f} px: more poses would help",
             )
+    if found.misfit is not None:
+        yield Reason(
+            "acceptable",
+            "the model of the camera's lens does not fit: with their distance from the middle of the image, corners "
+            f"lie up to {-found.misfit.inwards_px:.2g} px inside and {found.misfit.outwards_px:.2g} px outside of "
+            "where it puts them. The focal length may be wrong by more than its sigma. Wide-angle and fisheye lenses have no "
+            "model beyond k1, k2: use a longer lens, or crop photographs and captures alike to the middle",
+        )
 
 
 def _band(value: float, limits: tuple[float, float]) -> Band:

@@ -85,7 +85,7 @@ def test_a_lens_that_is_none_of_the_models_is_no_good_calibration(seed):
 
 def test_the_verdict_says_that_a_lens_does_not_fit(both):
     _, found = both
-    verdict = judge_calibration(replace(found, misfit=(RadialMisfit(-0.2, 0.1), None)))
+    verdict = judge_calibration(replace(found, misfit=RadialMisfit(-0.2, 0.1)))
     assert verdict.band != "good"
     assert any("camera's lens does not fit" in reason and "fisheye" in reason for reason in verdict.reasons)
 
