@@ -170,8 +170,8 @@ def _reasons(found: BoardCalibration) -> Iterator[Reason]:
             "acceptable",
             "the model of the camera's lens does not fit: with their distance from the middle of the image, corners "
             f"lie up to {-found.misfit.inwards_px:.2g} px inside and {found.misfit.outwards_px:.2g} px outside of "
-            "where it puts them. The focal length may be wrong by more than its sigma. Wide-angle and fisheye lenses have no "
-            "model beyond k1, k2: use a longer lens, or crop photographs and captures alike to the middle",
+            "where it puts them. The focal length may be wrong by more than its sigma. Wide-angle and fisheye lenses "
+            "have no model beyond k1, k2: use a longer lens, or crop photographs and captures alike to the middle",
         )
 
 
