@@ -18,8 +18,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
 
 from benchmarks.common.measuring import Rows, parsed
 from benchmarks.common.runs import process
@@ -45,7 +43,6 @@ from sl_nerfstudio.processing.process import register_clouds
 from sl_nerfstudio.processing.projector import calibrate_frames
 from sl_nerfstudio.registration.register import chosen_clouds
 from sl_nerfstudio.scan import read_scan
-from sl_nerfstudio.scan.types import PoseSigma
 
 _BEYOND = 3.0  # stated sigma, per axis
 _STEPS = ("rendered", "decoded", "registered", "adjusted", "scan")
@@ -88,20 +85,12 @@ class Row:
     slipped_pixels: float  # share of them that are more than half a period off
     camera_deg: float  # median over the right frames
     sigma_deg: float  # median of what is stated for the frames in the scan, per axis
+    within_1_sigma: float  # share of the frames in the scan; camera rotation
+    within_2_5_sigma: float
     verdict: str  # of sl-process; without it, what registration says of turns and order
     seconds: float
     errors: tuple[PoseError, ...]
     message: str  # why there is no scan
-
-
-@dataclass(frozen=True)
-class Placed:
-    """A frame as registration or the joint adjustment left it."""
-
-    name: str
-    T_world_camera: Float64[ndarray, "4 4"]
-    T_world_projector: Float64[ndarray, "4 4"]
-    pose_sigma: PoseSigma | None
 
 
 def measure(captures: Path, config: Config) -> Row:
@@ -130,7 +119,8 @@ def _by_sl_process(captures: Path, config: Config) -> tuple[Sequence[FoundFrame]
     message = process(captures, output, work, config.jobs, *["--unordered"] * note_of(captures)["unordered"])
     if message:
         raise UserError(message)
-    return read_scan(output).frames, json.loads((output / "processing.json").read_text())["verdict"]
+    frames = [FoundFrame(f.name, f.T_world_camera, f.T_world_projector, f.pose_sigma) for f in read_scan(output).frames]
+    return frames, json.loads((output / "processing.json").read_text())["verdict"]
 
 
 def _in_this_process(captures: Path, config: Config) -> tuple[Sequence[FoundFrame], str]:
@@ -148,7 +138,7 @@ def _in_this_process(captures: Path, config: Config) -> tuple[Sequence[FoundFram
     kept = adjust_consistent(clouds, found, _silent) if adjust else registered_only(clouds, found)
     index, poses = np.flatnonzero(kept.registration.registered).tolist(), kept.adjusted.poses
     frames = [
-        Placed(clouds[k].name, poses.T_world_camera[k], poses.T_world_projector[k], kept.adjusted.sigma[k])
+        FoundFrame(clouds[k].name, poses.T_world_camera[k], poses.T_world_projector[k], kept.adjusted.sigma[k])
         for k in index
     ]
     says = (
@@ -169,6 +159,7 @@ def row_of(
 ) -> Row:  # fmt: skip
     """The figures of a set; a frame in the scan that does not show the object at all counts as wrong."""
     decoding, errors = decoding or NOTHING_DECODED, pose_errors(found, truth)
+    ratio = np.array([error.over_sigma for error in errors if np.isfinite(error.over_sigma)])
     right, kept, usable = {error.name for error in errors if error.right}, [f.name for f in found], truth.usable
     return Row(
         name=captures.name, appearance=note_of(captures)["appearance"],
@@ -178,6 +169,8 @@ def row_of(
         groups=group_sizes(found, truth), decoded=decoding.decoded, median_px=decoding.median_px,
         wrong_pixels=decoding.wrong, slipped_pixels=decoding.slipped,
         camera_deg=_median([e.camera_deg for e in errors if e.right]), sigma_deg=_median([e.sigma_deg for e in errors]),
+        within_1_sigma=float((ratio <= 1).mean()) if len(ratio) else float("nan"),
+        within_2_5_sigma=float((ratio <= 2.5).mean()) if len(ratio) else float("nan"),
         verdict=verdict, seconds=seconds, errors=tuple(errors), message=message,
     )  # fmt: skip
 

@@ -9,7 +9,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,28 +29,14 @@ from sl_nerfstudio.scan.types import PoseSigma
 _POINTS = 400  # of the object in each frame, with which poses are judged
 
 
-class FoundFrame(Protocol):
-    """A frame where a scan, or registration alone, has it."""
+@dataclass(frozen=True)
+class FoundFrame:
+    """A frame where a scan, or registration alone, has it, in any axes and unit."""
 
-    @property
-    def name(self) -> str:
-        """That of its image."""
-        ...
-
-    @property
-    def T_world_camera(self) -> Float64[ndarray, "4 4"]:
-        """Pose of the camera, in any axes and unit."""
-        ...
-
-    @property
-    def T_world_projector(self) -> Float64[ndarray, "4 4"]:
-        """Pose of the projector in the same."""
-        ...
-
-    @property
-    def pose_sigma(self) -> PoseSigma | None:
-        """What is stated for them."""
-        ...
+    name: str  # of its image
+    T_world_camera: Float64[ndarray, "4 4"]
+    T_world_projector: Float64[ndarray, "4 4"]
+    pose_sigma: PoseSigma | None
 
 
 @dataclass(frozen=True)
@@ -179,7 +165,7 @@ def pose_errors(found: Sequence[FoundFrame], truth: Truth) -> list[PoseError]:
 def group_sizes(found: Sequence[FoundFrame], truth: Truth) -> tuple[int, ...]:
     """Sizes of the groups into which frames fall whose cameras are turned rightly against each other, largest first."""
     turns = [truth.frames[f.name].frame.T_world_camera[:3, :3] @ f.T_world_camera[:3, :3].T for f in found]
-    near = np.array([[_turn_deg(a, b) <= WRONG_DEG for b in turns] for a in turns]).reshape(len(turns), -1)
+    near = np.array([[_turn_deg(a, b) <= WRONG_DEG for b in turns] for a in turns]).reshape(len(turns), len(turns))
     left, sizes = np.ones(len(turns), dtype=bool), []
     while left.any():
         group = near[(near & left).sum(1).argmax()] & left

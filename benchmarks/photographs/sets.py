@@ -5,10 +5,9 @@ import os
 import re
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -25,38 +24,11 @@ from sl_nerfstudio.synthesis.synthesise import synthesise
 PATTERN = GridPattern(w=920, h=920)
 """46 x 46 nodes: with the object filling an image of 600 pixels, a period is about 14 of them wide."""
 
-
-Order = Literal["in order", "shuffled", "half"]
-_ENDINGS: dict[str, Order] = {"": "in order", "-shuffled": "shuffled", "-half": "half"}
 _NAME = re.compile(r"(.+)-(none|table|walls)-(plain|realistic|hard)-(\d+)(|-shuffled|-half)")
 SET = "set.json"
 """What a folder of captures says of itself: `unordered`, `appearance`, and its `frames`' numbers in the truth."""
 WORK = "work"
 """The folder of decoded frames in a folder of captures."""
-
-
-@dataclass(frozen=True)
-class CaptureSet:
-    """One set. Its `name` changes with everything that changes the images."""
-
-    name: str
-    scene: str
-    background: Background
-    appearance: AppearanceKind
-    seed: int
-    order: Order  # around the object, in order or shuffled; or in order around half of it
-    unordered: bool = False  # sl-process is told that the order says nothing
-
-
-def named(name: str, unordered: bool = False) -> CaptureSet | None:
-    """The set of a name, for example "frog-table-plain-801-shuffled"; None if no set is named so."""
-    found = _NAME.fullmatch(name)
-    if found is None or found[1] not in {**BUILT_IN, **PARTS}:
-        return None
-    background, appearance = cast(Background, found[2]), cast(AppearanceKind, found[3])
-    return CaptureSet(name, found[1], background, appearance, int(found[4]), _ENDINGS[found[5]], unordered)
-
-
 GROUPS: dict[str, tuple[str, ...]] = {
     "objects": (
         "frog-none-plain-501", "dog-table-plain-502", "vase-walls-plain-503", "chair-none-plain-504-shuffled",
@@ -105,29 +77,30 @@ def note_of(captures: Path) -> dict[str, Any]:
 
 def captures_of(name: str, frames: int, resolution: int, folder: Path) -> Path:
     """The captures of a set below `folder`, rendered unless an earlier run did so completely."""
-    one = named(name, name in _TOLD)
-    if one is None:
+    parts = _NAME.fullmatch(name)
+    if parts is None or parts[1] not in {**BUILT_IN, **PARTS}:
         raise UserError(
             f"--sets {name}: no set is named so; there are {', '.join(chain(*GROUPS.values()))}; a new one is named "
             "SCENE-BACKGROUND-APPEARANCE-SEED, with -shuffled at the end if its order is random, with -half if its "
             "frames go around half of the object"
         )
-    root = folder / f"{one.name}-{frames}-{resolution}"
+    scene, background, appearance, seed, order = parts.groups()
+    root = folder / f"{name}-{frames}-{resolution}"
     if root.exists():
         return root
     pattern = folder / "pattern.json"
     write_atomic(pattern, PATTERN.encode())
     config = SynthConfig(
-        scene=one.scene, background=one.background, appearance=one.appearance, seed=one.seed, frames=frames,
-        resolution=resolution, pattern=pattern, path="half-turn" if one.order == "half" else "hand-held",
-        images_only=True,
+        scene=scene, background=cast(Background, background), appearance=cast(AppearanceKind, appearance),
+        seed=int(seed), frames=frames, resolution=resolution, pattern=pattern,
+        path="half-turn" if order == "-half" else "hand-held", images_only=True,
     )  # fmt: skip
     # two runs side by side, or one that is interrupted, must not leave half a set under its name
     started = folder / f".{root.name}-{os.getpid()}"
     shutil.rmtree(started, ignore_errors=True)
     synthesise(config, started)
-    numbers = _renamed(started / "images", one)
-    note = {"unordered": one.unordered, "appearance": one.appearance, "frames": numbers}
+    numbers = _numbers(started / "images", int(seed) if order == "-shuffled" else None)
+    note = {"unordered": name in _TOLD, "appearance": appearance, "frames": numbers}
     (started / SET).write_text(json.dumps(note, indent=1) + "\n")
     try:
         started.rename(root)
@@ -138,13 +111,13 @@ def captures_of(name: str, frames: int, resolution: int, folder: Path) -> Path:
     return root
 
 
-def _renamed(images: Path, one: CaptureSet) -> dict[str, int]:
-    """Number in the truth of each image by its name; shuffled ones get names in random order."""
+def _numbers(images: Path, seed: int | None) -> dict[str, int]:
+    """Number in the truth of each image by its name; with a seed the images get names in random order."""
     found = sorted(images.iterdir())
-    if one.order != "shuffled":
+    if seed is None:
         return {image.stem: number for number, image in enumerate(found)}
     numbers = {}
-    for place, number in enumerate(np.random.default_rng(one.seed).permutation(len(found)).tolist()):
+    for place, number in enumerate(np.random.default_rng(seed).permutation(len(found)).tolist()):
         image = found[number].rename(images / f"photo_{place:03d}{found[number].suffix}")
         numbers[image.stem] = number
     return numbers
