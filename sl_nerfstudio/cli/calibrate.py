@@ -177,11 +177,13 @@ def _decoder(config: CalibrateConfig, found: "Captures") -> "Decoder[Any]":
         print(
             f"projector: taken to have {layout.w} x {layout.h} pixels; if not, say so as --pattern 1024x768", flush=True
         )
-        return choose_decoder(layout, None, config.images)
+        return choose_decoder(layout, None, config.images, config.sequence is not None)
     size = resolution(config.pattern)
-    if size is not None:
-        return choose_decoder(recognise_sequence(found, size, config.sequence, None), None, config.pattern)
-    return choose_decoder(layout_in_order(config.pattern, config.sequence), None, config.pattern)
+    if size is None:
+        layout = layout_in_order(config.pattern, config.sequence)
+    else:
+        layout = recognise_sequence(found, size, config.sequence, None)
+    return choose_decoder(layout, None, config.pattern, config.sequence is not None)
 
 
 # What sl-calibrate says about its result.

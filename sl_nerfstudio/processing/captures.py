@@ -13,11 +13,11 @@ import numpy as np
 from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.decoders import GrayCodeDecoder
 from sl_nerfstudio.decoding.gray_code import check_count
-from sl_nerfstudio.decoding.gray_code_order import layout_of_images, possible_layouts
+from sl_nerfstudio.decoding.gray_code_order import layout_of_images, possible_layouts, with_numbering
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.gray_code import GrayCode
-from sl_nerfstudio.pattern.layout import PatternLayout, SequenceName
+from sl_nerfstudio.pattern.layout import CENTRED, PatternLayout, SequenceName
 from sl_nerfstudio.processing.config import FEWEST_FRAMES
 from sl_nerfstudio.scan.document import FileError, unreadable
 from sl_nerfstudio.scan.images import ENDINGS, RAW, photograph_header, raw_file, read_photograph, turned_by_tag
@@ -218,6 +218,11 @@ def likely_layout(captures: Captures, name: SequenceName) -> GrayCode:
     """
     whole = captures.require_whole()
     count = len(whole[0].images)
+    if name in CENTRED:
+        raise UserError(
+            f"--sequence {name}: does not tell the projector's resolution\n    cause:  its codes depend on it\n"
+            "    remedy: give the resolution, as --pattern 1024x768"
+        )
     fitting = [layout for w, h in STANDARD if (layout := GrayCode.in_order(name, w, h)).images == count]
     if not fitting:
         raise FileError(
@@ -253,7 +258,7 @@ def describe_sequence(layout: GrayCode) -> str:
     """One line for the output."""
     return (
         f"Gray code of {layout.w} x {layout.h} pixels in cells of {layout.cell}: {layout.images} images, order "
-        f"{layout.order}"
+        f"{layout.order}{', cells numbered from the middle of the code' if layout.centred else ''}"
     )
 
 
@@ -305,14 +310,18 @@ def recognise_sequence(
     whole = captures.require_whole()
     found: dict[GrayCode, Path] = {}
     errors: list[UserError] = []
+    centred = False
     for frame in whole[:_LOOKED_AT]:
         folder = frame.images[0].parent
         try:
             possible = possible_layouts(len(frame.images), size, name, cell)
+            images = [read_photograph(path) for path in frame.images]
             if len(possible) == 1 and possible[0].bit_images(0) and name is not None:
-                found.setdefault(possible[0], folder)  # nothing to recognise: a frame that does not fit says so itself
-                continue
-            found.setdefault(layout_of_images([read_photograph(p) for p in frame.images], size, name, cell), folder)
+                layout = with_numbering(possible[0], images)  # a frame that does not fit says so itself
+            else:
+                layout = layout_of_images(images, size, name, cell)
+            centred = centred or layout.centred  # a frame that shows the middle alone does not tell
+            found.setdefault(replace(layout, centred=False), folder)
         except FileError as error:
             errors.append(error)
         except DecodingError as error:
@@ -326,4 +335,4 @@ def recognise_sequence(
             f"{second.cell})\n    cause:  the folders hold captures of several sequences\n"
             "    remedy: process them separately, or name the sequence with --sequence"
         )
-    return next(iter(found))
+    return replace(next(iter(found)), centred=centred)

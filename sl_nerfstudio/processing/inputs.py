@@ -276,7 +276,9 @@ def read_captured(config: ProcessConfig) -> CapturedFrames:
             "a video shows the frames of one camera",
             "give a file with this camera alone",
         )
-    decoder = None if layout is None else choose_decoder(layout, config.decoder, config.pattern)
+    decoder = (
+        None if layout is None else choose_decoder(layout, config.decoder, config.pattern, config.sequence is not None)
+    )
     captures = find_captures(root, decoder is None or decoder.sequence, cameras)
     if not config.not_mosaic and video is None:
         _refuse_mosaics(captures)
@@ -284,7 +286,7 @@ def read_captured(config: ProcessConfig) -> CapturedFrames:
         layout = recognise_sequence(captures, size, config.sequence, config.cell)
     if layout is None:
         raise ValueError("a pattern is a file or a resolution")
-    decoder = decoder or choose_decoder(layout, config.decoder, config.pattern)
+    decoder = decoder or choose_decoder(layout, config.decoder, config.pattern, config.sequence is not None)
     sentences: Sequence[str] = [] if video is None else video.sentences()
     if not isinstance(layout, GrayCode):
         return CapturedFrames(decoder, captures, CaptureNotes(tuple(sentences), video=video))
