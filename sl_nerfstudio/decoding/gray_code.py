@@ -446,8 +446,8 @@ def _notes(layout: GrayCode, light: SequenceLight, finest: Sequence[int]) -> Ite
     if any(size > least for size, least in zip(finest, shown, strict=True)):
         x, y = finest
         yield (
-            f"decoded to {f'{x} px' if x == y else f'{x} px along x and {y} px along y'}: finer stripes have a contrast "
-            f"below {_RESOLVED:.0%} (out of focus, or too fine for the camera) and are not used"
+            f"decoded to {f'{x} px' if x == y else f'{x} px along x and {y} px along y'}: finer stripes have a "
+            f"contrast below {_RESOLVED:.0%} (out of focus, or too fine for the camera) and are not used"
         )
     if light.saturated > OVEREXPOSED:
         yield (
