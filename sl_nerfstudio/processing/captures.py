@@ -19,6 +19,7 @@ from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import CENTRED, PatternLayout, SequenceName
 from sl_nerfstudio.processing.config import FEWEST_FRAMES
+from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError, unreadable
 from sl_nerfstudio.scan.images import ENDINGS, RAW, photograph_header, raw_file, read_photograph, turned_by_tag
 
@@ -40,10 +41,13 @@ class SeveralFaults(FileError):
 
     def __init__(self, folder: Path, errors: Sequence[FileError]) -> None:
         """`folder` holds the frame's images."""
-        listed = [f"{e.path.name if e.path != folder else 'the folder'} {e.problem}" for e in errors]
-        more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+        same: dict[str, list[str]] = {}
+        for e in errors:
+            same.setdefault(e.problem, []).append(e.path.name if e.path != folder else "the folder")
+        found = [f"{listed(n, _LISTED)}{': each' if len(n) > 1 else ''} {problem}" for problem, n in same.items()]
+        more = f"; and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
         causes, remedies = (dict.fromkeys(getattr(e, key) for e in errors) for key in ("cause", "remedy"))
-        problem = f"has {len(errors)} faults: {'; '.join(listed[:_LISTED])}{more}"
+        problem = f"has {len(errors)} faults: {'; '.join(found[:_LISTED])}{more}"
         super().__init__(folder, problem, "; ".join(causes), "; ".join(remedies))
         self.errors = tuple(errors)
 
@@ -150,7 +154,7 @@ def _checked(frames: Sequence[CapturedFrame]) -> Captures:
         own = [path for frame in frames if frame.camera == camera for path in frame.images]
         known = [sizes[path] for path in own if path in sizes]
         if not known:
-            raise next(faults[frame.name][0] for frame in frames if frame.camera == camera)
+            raise _of_a_kind([e for frame in frames if frame.camera == camera for e in faults[frame.name]])[0]
         usual[camera] = Counter(known).most_common(1)[0][0]
     for frame in frames:
         for path in frame.images:
@@ -158,6 +162,24 @@ def _checked(frames: Sequence[CapturedFrame]) -> Captures:
                 faults.setdefault(frame.name, []).append(_other_size(path, sizes[path], usual[frame.camera]))
     named = {frame.name: frame for frame in frames}
     return Captures(tuple(frames), usual, {name: _together(named[name], found) for name, found in faults.items()})
+
+
+def describe_faults(captures: Captures) -> list[str]:
+    """What is wrong with the frames that cannot be used, in one message for each kind of fault."""
+    return list(map(str, _of_a_kind(list(captures.faults.values()))))
+
+
+def _of_a_kind(errors: Sequence[FileError]) -> list[FileError]:
+    """One error for all files with the same problem, which names them."""
+    same: dict[str, list[FileError]] = {}
+    for error in errors:
+        same.setdefault(error.problem, []).append(error)
+    out = []
+    for first, *others in same.values():
+        names = [error.path.name for error in others]
+        more = f" (and so {'are' if len(names) > 1 else 'is'} {listed(names, _LISTED)})" if names else ""
+        out.append(first if not more else FileError(first.path, first.problem + more, first.cause, first.remedy))
+    return out
 
 
 def _together(frame: CapturedFrame, errors: Sequence[FileError]) -> FileError:

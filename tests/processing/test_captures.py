@@ -10,7 +10,7 @@ from PIL import Image
 from sl_nerfstudio.calibration.formats import camera_names, read_device_file
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.gray_code import GrayCode
-from sl_nerfstudio.processing.captures import find_captures, incomplete
+from sl_nerfstudio.processing.captures import describe_faults, find_captures, incomplete
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.inputs import read_captured
 from sl_nerfstudio.scan.images import encode_png
@@ -54,6 +54,28 @@ def test_images_of_another_size_and_unreadable_ones_are_faults_of_their_frames(t
     assert "f2.png: is empty" in empty
     assert "f4.png: is 32 x 24 pixels" in large and "resized, cropped" in large
     assert all("remedy:" in text for text in (turned, empty, large))
+
+
+def test_all_files_with_the_same_fault_are_named_together(tmp_path):
+    for k in range(4):
+        _write(tmp_path / f"f{k}.png")
+    _write(tmp_path / "hidden.png", 8, 6)
+    for name in ("cut1.png", "cut2.png"):
+        Image.new("RGBA", (16, 12), (9, 9, 9, 100)).save(tmp_path / name)
+    sentences = describe_faults(find_captures(tmp_path, sequences=False))
+    assert len(sentences) == 2
+    assert "cut1.png: is transparent in places (and so is cut2.png)" in sentences[0]
+    assert "hidden.png: is 8 x 6 pixels, most images are 16 x 12" in sentences[1]
+    for k in range(4):
+        (tmp_path / f"f{k}.png").unlink()
+    (tmp_path / "hidden.png").unlink()
+    with pytest.raises(UserError, match=r"cut1.png: is transparent in places \(and so is cut2.png\)"):
+        find_captures(tmp_path, sequences=False)
+    for k in range(8):
+        _write(tmp_path / "sequence" / f"{k}.png", mode="RGBA" if k else "L")  # transparent
+        _write(tmp_path / "whole" / f"{k}.png")
+    fault = find_captures(tmp_path, sequences=True).faults["sequence"]
+    assert "has 7 faults: 1.png, 2.png, 3.png, 4.png, 5.png and 2 more: each is transparent in places" in str(fault)
 
 
 @pytest.mark.parametrize(
