@@ -8,6 +8,7 @@ cost little.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -23,11 +24,13 @@ from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, ge
 _BEHIND_PX = 1e4  # the residual of a corner behind a device: a step that turns a board over must not look good
 _KERNEL = 4.0  # standard deviations at which a corner's weight is a quarter (Geman-McClure)
 _LEAST_SIGMA = 1e-6  # pixels: noise-free corners
-_ROUNDS, _SETTLED = 4, 0.02  # of estimating the noise, and its relative change in the last one
+_ROUNDS, _SETTLED = 6, 0.02  # of estimating the noise, and its relative change in the last one
 _TOLERANCE, _FIRST_DAMPING = 1e-6, 1e-5  # share of the cost that may be left to gain
 _PLACING_STEPS = 4
 _SINGULAR = 1e-14  # of the largest eigenvalue, with all numbers scaled alike
 _FOCAL_LENGTHS = (0.6, 1.0, 1.6, 2.5, 4.0)  # in widths of the image
+_ASPECTS = (1.0, 0.5, 0.7, 1.4, 2.0)  # fl_y over fl_x: pixels need not be square
+_SQUARE = 1.3  # noise with square pixels, relative to that with two focal lengths: up to here they are taken as square
 _CENTRES = (0.5, 1.0, 0.0, 1.3, -0.3)  # principal point of a projector, in heights of the pattern: lens shift
 _TRIED = 3  # of the starts that fit best, how many are adjusted
 _AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenCV's device axes and ours
@@ -322,14 +325,14 @@ def _exp(twists: Float64[ndarray, "n 6"]) -> Float64[ndarray, "n 4 4"]:
 def camera_start(views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"]) -> AdjustedBoard:
     """The camera without lens distortion, and the boards."""
     w, h = size
-    focals = [*(share * max(size) for share in _FOCAL_LENGTHS), *_closed_form(views, size, p_board)]
+    focals = [(share * max(size), aspect * share * max(size)) for share in _FOCAL_LENGTHS for aspect in _ASPECTS]
     found: list[tuple[float, BoardRig]] = []
-    for focal in focals:
-        camera = Device(w, h, focal, focal, w / 2, h / 2)
+    for fl_x, fl_y in [*focals, *_closed_form(views, size, p_board)]:
+        camera = Device(w, h, fl_x, fl_y, w / 2, h / 2)
         solved = [_pose(camera, p_board, view.camera) for view in views]
         T = np.array([pose for pose, _ in solved])
         found.append((float(sum(cost for _, cost in solved)), BoardRig(camera, None, T, np.eye(4))))
-    return _best(found, (FreeIntrinsics(),), sightings(views, p_board)[:1])
+    return _best(found, (), sightings(views, p_board)[:1])
 
 
 def projector_start(
@@ -339,23 +342,32 @@ def projector_start(
     points, pixels = _seen_by_projector(camera.rig, views, p_board)
     w, h = size
     found: list[tuple[float, BoardRig]] = []
-    for focal in _FOCAL_LENGTHS:
-        for centre in _CENTRES:
-            device = Device(w, h, focal * w, focal * w, w / 2, centre * h, model=model)
-            T, cost = _pose(device, points, Corners(np.arange(len(points)), pixels))
-            rig = BoardRig(camera.rig.camera, device, camera.rig.T_camera_board, T)
-            found.append((cost, rig))
-    return _best(found, (*camera.free, FreeIntrinsics()), sightings(views, p_board))
+    for focal, aspect, centre in product(_FOCAL_LENGTHS, _ASPECTS, _CENTRES):
+        device = Device(w, h, focal * w, aspect * focal * w, w / 2, centre * h, model=model)
+        T, cost = _pose(device, points, Corners(np.arange(len(points)), pixels))
+        found.append((cost, BoardRig(camera.rig.camera, device, camera.rig.T_camera_board, T)))
+    return _best(found, camera.free, sightings(views, p_board))
 
 
-def _best(found: list[tuple[float, BoardRig]], free: Free, seen: Seen) -> AdjustedBoard:
-    """The best solution from the starts that fit best."""
+def _best(found: list[tuple[float, BoardRig]], known: Free, seen: Seen) -> AdjustedBoard:
+    """The best solution from the starts that fit best, with square pixels of the last device if they explain as much.
+
+    `known` are the free intrinsics of the devices before the last.
+    """
     tried = sorted(found, key=lambda one: one[0])[:_TRIED]
-    return min((adjust(rig, free, seen) for _, rig in tried), key=lambda one: one.sigma_px[-1])
+    free = (*known, FreeIntrinsics(aspect=True))
+    best = min((adjust(rig, free, seen) for _, rig in tried), key=lambda one: one.sigma_px[-1])
+    *others, last = best.rig.devices
+    focal = float(np.sqrt(last.fl_x * last.fl_y))
+    rig = best.rig.with_devices([*others, replace(last, fl_x=focal, fl_y=focal)])
+    square = adjust(rig, (*known, FreeIntrinsics()), seen)
+    return square if square.sigma_px[-1] < _SQUARE * best.sigma_px[-1] else best
 
 
-def _closed_form(views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"]) -> Iterator[float]:
-    """The common focal length from all homographies, with the principal point in the middle; nothing if imaginary."""
+def _closed_form(
+    views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"]
+) -> Iterator[tuple[float, float]]:
+    """Both focal lengths from all homographies, with the principal point in the middle; nothing if imaginary."""
     rows, right = [], []
     for view in views:
         if len(view.camera.ids) < _LEAST_CORNERS:
@@ -365,12 +377,13 @@ def _closed_form(views: Sequence[BoardView], size: Size, p_board: Float64[ndarra
             continue
         first, second = H[:, 0], H[:, 1]
         scale = np.linalg.norm(first) * np.linalg.norm(second)
-        rows += [first[:2] @ second[:2] / scale, (first[:2] @ first[:2] - second[:2] @ second[:2]) / scale]
+        rows += [first[:2] * second[:2] / scale, (first[:2] ** 2 - second[:2] ** 2) / scale]
         right += [-first[2] * second[2] / scale, (second[2] ** 2 - first[2] ** 2) / scale]
     if rows:
-        squared = float(np.dot(rows, rows) / np.dot(rows, right)) if np.dot(rows, right) else -1.0
-        if squared > 0:
-            yield float(np.clip(np.sqrt(squared), 0.2 * max(size), 50 * max(size)))
+        inverse = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
+        if (inverse > 0).all():
+            fl_x, fl_y = np.clip(1 / np.sqrt(inverse), 0.2 * max(size), 50 * max(size))
+            yield float(fl_x), float(fl_y)
 
 
 def _pose(device: Device, points: Float64[ndarray, "m 3"], corners: Corners) -> tuple[Float64[ndarray, "4 4"], float]:
