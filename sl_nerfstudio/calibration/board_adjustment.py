@@ -24,13 +24,13 @@ from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, ge
 _BEHIND_PX = 1e4  # the residual of a corner behind a device: a step that turns a board over must not look good
 _KERNEL = 4.0  # standard deviations at which a corner's weight is a quarter (Geman-McClure)
 _LEAST_SIGMA = 1e-6  # pixels: noise-free corners
-_ROUNDS, _SETTLED = 6, 0.02  # of estimating the noise, and its relative change in the last one
+_ROUNDS, _SETTLED = 4, 0.02  # of estimating the noise, and its relative change in the last one
 _TOLERANCE, _FIRST_DAMPING = 1e-6, 1e-5  # share of the cost that may be left to gain
 _PLACING_STEPS = 4
 _SINGULAR = 1e-14  # of the largest eigenvalue, with all numbers scaled alike
 _FOCAL_LENGTHS = (0.6, 1.0, 1.6, 2.5, 4.0)  # in widths of the image
 _ASPECTS = (1.0, 0.5, 0.7, 1.4, 2.0)  # fl_y over fl_x: pixels need not be square
-_SQUARE = 1.3  # noise with square pixels, relative to that with two focal lengths: up to here they are taken as square
+_SQUARE = 2.0  # noise with square pixels, relative to that with two focal lengths: up to here they are taken as square
 _CENTRES = (0.5, 1.0, 0.0, 1.3, -0.3)  # principal point of a projector, in heights of the pattern: lens shift
 _TRIED = 3  # of the starts that fit best, how many are adjusted
 _AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenCV's device axes and ours
@@ -354,20 +354,24 @@ def _best(found: list[tuple[float, BoardRig]], known: Free, seen: Seen) -> Adjus
 
     `known` are the free intrinsics of the devices before the last.
     """
-    tried = sorted(found, key=lambda one: one[0])[:_TRIED]
-    free = (*known, FreeIntrinsics(aspect=True))
-    best = min((adjust(rig, free, seen) for _, rig in tried), key=lambda one: one.sigma_px[-1])
-    *others, last = best.rig.devices
-    focal = float(np.sqrt(last.fl_x * last.fl_y))
-    rig = best.rig.with_devices([*others, replace(last, fl_x=focal, fl_y=focal)])
-    square = adjust(rig, (*known, FreeIntrinsics()), seen)
-    return square if square.sigma_px[-1] < _SQUARE * best.sigma_px[-1] else best
+    ordered = [rig for _, rig in sorted(found, key=lambda one: one[0])]
+
+    def best(square: bool) -> AdjustedBoard:
+        free = (*known, FreeIntrinsics(aspect=not square))
+        starts = [rig for rig in ordered if (rig.devices[-1].fl_x == rig.devices[-1].fl_y) == square]
+        return min((adjust(rig, free, seen) for rig in starts[:_TRIED]), key=lambda one: one.sigma_px[-1])
+
+    square, other = best(True), best(False)
+    return square if square.sigma_px[-1] < _SQUARE * other.sigma_px[-1] else other
 
 
 def _closed_form(
     views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"]
 ) -> Iterator[tuple[float, float]]:
-    """Both focal lengths from all homographies, with the principal point in the middle; nothing if imaginary."""
+    """One focal length for both axes, then two, from all homographies, with the principal point in the middle.
+
+    Those that are imaginary are left out.
+    """
     rows, right = [], []
     for view in views:
         if len(view.camera.ids) < _LEAST_CORNERS:
@@ -379,11 +383,12 @@ def _closed_form(
         scale = np.linalg.norm(first) * np.linalg.norm(second)
         rows += [first[:2] * second[:2] / scale, (first[:2] ** 2 - second[:2] ** 2) / scale]
         right += [-first[2] * second[2] / scale, (second[2] ** 2 - first[2] ** 2) / scale]
-    if rows:
-        inverse = np.linalg.lstsq(np.array(rows), np.array(right), rcond=None)[0]
+    by_axis, least = np.array(rows).reshape(-1, 2), 0.2 * max(size)
+    for columns in (by_axis.sum(1, keepdims=True), by_axis) if rows else ():
+        inverse = np.linalg.lstsq(columns, np.array(right), rcond=None)[0]
         if (inverse > 0).all():
-            fl_x, fl_y = np.clip(1 / np.sqrt(inverse), 0.2 * max(size), 50 * max(size))
-            yield float(fl_x), float(fl_y)
+            focal = np.clip(1 / np.sqrt(inverse), least, 250 * least)
+            yield float(focal[0]), float(focal[-1])
 
 
 def _pose(device: Device, points: Float64[ndarray, "m 3"], corners: Corners) -> tuple[Float64[ndarray, "4 4"], float]:
