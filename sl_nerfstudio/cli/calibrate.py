@@ -153,11 +153,13 @@ def read_inputs(config: CalibrateConfig, board: "Board") -> CalibrationInputs:
 
 def _photographs(config: CalibrateConfig) -> "Captures":
     """Poses in sub-folders; for the camera alone, also single images."""
+    from sl_nerfstudio.calibration.board import FEWEST_VIEWS
     from sl_nerfstudio.processing.captures import find_captures
 
-    if config.camera_only and any(path.is_file() for path in _content(config)):
-        return find_captures(config.images, sequences=False)
-    return find_captures(config.images, sequences=True)
+    single = config.camera_only and any(path.is_file() for path in _content(config))
+    return find_captures(
+        config.images, not single, (), FEWEST_VIEWS, f"a calibration needs {FEWEST_VIEWS} poses at least"
+    )
 
 
 def _content(config: CalibrateConfig) -> list[Any]:

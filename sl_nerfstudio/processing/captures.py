@@ -79,20 +79,27 @@ class Captures:
         return replace(self, faults={name: _together(named[name], errors) for name, errors in both.items()})
 
 
-def find_captures(root: Path, sequences: bool, cameras: Sequence[str] = ()) -> Captures:
+def find_captures(
+    root: Path,
+    sequences: bool,
+    cameras: Sequence[str] = (),
+    fewest: int = FEWEST_FRAMES,
+    needs: str = f"a scan needs at least {FEWEST_FRAMES} frames",
+) -> Captures:
     """Frames in a folder: one image each or, with `sequences`, one sub-folder of images each.
 
     With the names of several `cameras`, the frames of each are in a sub-folder of that name. Of each camera the most
     frequent image size is taken to be right. Images of another size, and images that cannot be read, are faults of
-    their frames. Raises FileError if there are fewer than two frames, or no folder for a camera.
+    their frames. Raises FileError, with the sentence `needs`, if there are fewer than `fewest` frames, or no folder for
+    a camera.
     """
     if not os.path.isdir(root):  # Path.is_dir raises for a name that is too long
         raise FileError(root, "is no folder", "a typing error in --images", "give the folder with the captures")
     try:
         found = _of_cameras(root, sequences, cameras) if cameras else [_frames(root, sequences)]
         frames = [frame for turn in zip_longest(*found) for frame in turn if frame is not None]
-        if len(frames) < FEWEST_FRAMES:
-            raise _too_few(root, sequences, len(frames))
+        if len(frames) < fewest:
+            raise _too_few(root, sequences, len(frames), needs)
     except OSError as error:
         raise unreadable(root, error) from error
     duplicates = [name for name, count in Counter(f.name for f in frames).items() if count > 1]
@@ -103,7 +110,17 @@ def find_captures(root: Path, sequences: bool, cameras: Sequence[str] = ()) -> C
     return _checked(frames)
 
 
-def _too_few(root: Path, sequences: bool, count: int) -> FileError:
+def _too_few(root: Path, sequences: bool, count: int, needed: str) -> FileError:
+    inside = [
+        path for path in sorted(root.iterdir()) if path.is_dir() and len(_frames(path, sequences)) > max(count, 1)
+    ]
+    if len(inside) == 1 and not _images(root):
+        return FileError(
+            root,
+            f"holds its captures in a folder of its own, {inside[0].name}",
+            "--images is the folder with the captures, not the one around it",
+            f"give --images {inside[0]}",
+        )
     raw = _images(root, RAW)
     if raw:
         return raw_file(raw[0])
@@ -114,9 +131,7 @@ def _too_few(root: Path, sequences: bool, count: int) -> FileError:
         cause = "the captures do not suit the pattern: a coded grid needs one image per frame, Gray code one sub-folder"
         remedy = "" if sequences else '; for several cameras, name them under "cameras" in the intrinsics file'
     wanted = "sub-folders, one for each frame" if sequences else f"{', '.join(ENDINGS)} files"
-    return FileError(
-        root, f"holds {count} {what}; a scan needs at least 2 frames", cause, f"give a folder of {wanted}{remedy}"
-    )
+    return FileError(root, f"holds {count} {what}; {needed}", cause, f"give a folder of {wanted}{remedy}")
 
 
 def _of_cameras(root: Path, sequences: bool, cameras: Sequence[str]) -> list[list[CapturedFrame]]:

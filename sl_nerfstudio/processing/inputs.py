@@ -94,9 +94,10 @@ def require_intrinsics(config: ProcessConfig, projector_needed: bool) -> None:
     """Raise UserError if no file is given, although the projector's intrinsics must be in one."""
     if projector_needed and config.intrinsics is None and config.projector_intrinsics is None:
         raise UserError(
-            "--intrinsics: no file is given\n    cause:  the intrinsics of the projector must be known\n"
-            "    remedy: give a file with camera and projector, or with the projector alone if the photographs state "
-            "the camera's focal length; sl-calibrate makes one"
+            "--intrinsics: no file is given\n    cause:  the intrinsics of both devices must be known, or found\n"
+            "    remedy: make a file with sl-calibrate; or give the camera's alone (sl-calibrate --camera-only) and "
+            "find the projector's from the captures: --estimate-projector; or the projector's alone, if the "
+            "photographs state the camera's focal length"
         )
 
 

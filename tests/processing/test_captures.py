@@ -82,6 +82,16 @@ def test_all_files_with_the_same_fault_are_named_together(tmp_path):
     ("sequences", "files", "message"),
     [
         (False, ["a.png"], "holds 1 images; a scan needs at least 2 frames"),
+        (
+            False,
+            ["images/1.png", "images/2.png"],
+            r"holds its captures in a folder of its own, images(.*\n)*.*/images$",
+        ),
+        (
+            True,
+            ["images/p/1.png", "images/q/1.png"],
+            r"in a folder of its own, images(.*\n)*.*give --images .*/images$",
+        ),
         (False, ["x/1.png", "y/1.png"], "holds 0 images.*\n.*do not suit the pattern: a coded grid needs"),
         (True, ["1.png", "2.png"], "holds 0 folders with images.*\n.*do not suit the pattern"),
         (False, ["a.png", "a.jpg", "b.png"], "several images named a"),
