@@ -157,9 +157,7 @@ def _photographs(config: CalibrateConfig) -> "Captures":
     from sl_nerfstudio.processing.captures import find_captures
 
     single = config.camera_only and any(path.is_file() for path in _content(config))
-    return find_captures(
-        config.images, not single, (), FEWEST_VIEWS, f"a calibration needs {FEWEST_VIEWS} poses at least"
-    )
+    return find_captures(config.images, not single, needs=f"a calibration needs {FEWEST_VIEWS} poses at least")
 
 
 def _content(config: CalibrateConfig) -> list[Any]:

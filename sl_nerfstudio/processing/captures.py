@@ -83,22 +83,21 @@ def find_captures(
     root: Path,
     sequences: bool,
     cameras: Sequence[str] = (),
-    fewest: int = FEWEST_FRAMES,
     needs: str = f"a scan needs at least {FEWEST_FRAMES} frames",
 ) -> Captures:
     """Frames in a folder: one image each or, with `sequences`, one sub-folder of images each.
 
     With the names of several `cameras`, the frames of each are in a sub-folder of that name. Of each camera the most
     frequent image size is taken to be right. Images of another size, and images that cannot be read, are faults of
-    their frames. Raises FileError, with the sentence `needs`, if there are fewer than `fewest` frames, or no folder for
-    a camera.
+    their frames. Raises FileError, which says what `needs` how many, if there are fewer than two frames, or no folder
+    for a camera.
     """
     if not os.path.isdir(root):  # Path.is_dir raises for a name that is too long
         raise FileError(root, "is no folder", "a typing error in --images", "give the folder with the captures")
     try:
         found = _of_cameras(root, sequences, cameras) if cameras else [_frames(root, sequences)]
         frames = [frame for turn in zip_longest(*found) for frame in turn if frame is not None]
-        if len(frames) < fewest:
+        if len(frames) < FEWEST_FRAMES:
             raise _too_few(root, sequences, len(frames), needs)
     except OSError as error:
         raise unreadable(root, error) from error
@@ -127,6 +126,8 @@ def _too_few(root: Path, sequences: bool, count: int, needed: str) -> FileError:
     what = "folders with images" if sequences else "images"
     other = _single_images(root) if sequences else _folders(root)
     cause, remedy = "a typing error in --images, or images of another format", ""
+    if count:
+        cause = f"too few were captured, or {cause}"
     if len(other) > 1:
         cause = "the captures do not suit the pattern: a coded grid needs one image per frame, Gray code one sub-folder"
         remedy = "" if sequences else '; for several cameras, name them under "cameras" in the intrinsics file'
