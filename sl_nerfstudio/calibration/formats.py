@@ -136,19 +136,13 @@ def stored_entries(path: Path, stored: dict[str, Any], step: int) -> list[Device
         if m1 in stored and m2 in stored:
             # procam-calibration measured at `step * index of the cell`, its first pixel; its middle is further.
             middle = FIRST_CENTRE + ((step - 1) / 2 if pair.by_cell else 0.0)
-            sizes = [_stored_size(path, stored, names) for names in (pair.camera_size, pair.projector_size)]
-            camera, projector = (size and size[::-1] if pair.by_cell else size for size in sizes)
+            labels = (m1, m2) if pair.by_cell else ("camera", "projector")
+            camera, projector = (
+                _stored_size(path, stored, names, pair.by_cell) for names in (pair.camera_size, pair.projector_size)
+            )
             return [
-                opencv_entry(path, m1 if pair.by_cell else "camera", "camera", camera, stored[m1], stored.get(d1)),
-                opencv_entry(
-                    path,
-                    m2 if pair.by_cell else "projector",
-                    "projector",
-                    projector,
-                    stored[m2],
-                    stored.get(d2),
-                    middle,
-                ),
+                opencv_entry(path, labels[0], "camera", camera, stored[m1], stored.get(d1)),
+                opencv_entry(path, labels[1], "projector", projector, stored[m2], stored.get(d2), middle),
             ]
     matrix = next((stored[key] for key in _MATRIX if key in stored), None)
     if matrix is None:
@@ -163,12 +157,17 @@ def stored_entries(path: Path, stored: dict[str, Any], step: int) -> list[Device
     return [opencv_entry(path, path.name, None, size, matrix, lens)]
 
 
-def _stored_size(path: Path, stored: dict[str, Any], names: Sequence[str]) -> tuple[int, int] | None:
+def _stored_size(
+    path: Path, stored: dict[str, Any], names: Sequence[str], rows_first: bool = False
+) -> tuple[int, int] | None:
     """The two numbers under the names; None where they are not stored, or 0, as SLStudio writes unknown sizes."""
     if not names or any(name not in stored for name in names):
         return None
     numbers = stored[names[0]] if len(names) == 1 else [stored[name] for name in names]
-    return None if len(names) > 1 and all(number == 0 for number in numbers) else image_size(path, numbers)
+    if len(names) > 1 and all(number == 0 for number in numbers):
+        return None
+    first, second = image_size(path, numbers)
+    return (second, first) if rows_first else (first, second)
 
 
 def opencv_entry(

@@ -385,7 +385,8 @@ def _nothing_fits(checks: Sequence[tuple[GrayCode, OrderCheck]]) -> DecodingErro
 
 def other_order(samples: Samples, layout: GrayCode) -> GrayCode | None:
     """The sequence of another program, for the same projector and cells, that photographs show; None if they do not."""
-    orders = {GrayCode.in_order(name, layout.w, layout.h, layout.cell) for name in ORDERS}
+    names: Sequence[SequenceName] = tuple(ORDERS)  # pyright: ignore[reportAssignmentType]
+    orders = {GrayCode.in_order(name, layout.w, layout.h, layout.cell) for name in names}
     others = (other for other in orders if other.images == layout.images and other.shown != layout.shown)
     return next((other for other in others if check_order(samples, other).fits), None)
 

@@ -12,6 +12,7 @@ import tempfile
 import time
 import weakref
 from contextlib import redirect_stdout
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,16 @@ import pytest
 from sl_nerfstudio.cli.process import main
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing import frames, records
-from sl_nerfstudio.processing.captures import find_captures
-from sl_nerfstudio.processing.frames import FrameWorker, clouds_of, describe_frame_stage, run_frame_stage, run_frames
+from sl_nerfstudio.processing.captures import CapturedFrame, find_captures
+from sl_nerfstudio.processing.frames import (
+    FrameStageResult,
+    FrameWorker,
+    capture_sentences,
+    clouds_of,
+    describe_frame_stage,
+    run_frame_stage,
+    run_frames,
+)
 from sl_nerfstudio.processing.records import digest
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png
@@ -295,3 +304,10 @@ def test_no_more_processes_are_started_than_there_is_memory_for(monkeypatch, meg
     found = frames.default_processes(int(megapixels * 1e6), gigabytes * 10**9)
     assert found == expected
     assert found == 1 or found * (1.4 + 0.2 * megapixels) + 1 < gigabytes
+
+
+def test_what_the_decoder_noted_is_said_once_with_its_frames():
+    frames = [FrameStageResult(CapturedFrame(f"f{k}", ()), notes=("decoded to 4 px",) * (k > 0)) for k in range(3)]
+    frames[1] = replace(frames[1], notes=("decoded to 4 px", "overexposed"))
+    assert capture_sentences(frames) == ["f1, f2: decoded to 4 px", "f1: overexposed"]
+    assert capture_sentences(frames[1:]) == ["all frames: decoded to 4 px", "f1: overexposed"]
