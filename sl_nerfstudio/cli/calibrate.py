@@ -129,6 +129,7 @@ def read_inputs(config: CalibrateConfig, board: "Board") -> CalibrationInputs:
     from sl_nerfstudio.calibration.board_captures import BoardPhotographs, read_board_captures
     from sl_nerfstudio.pattern.gray_code import GrayCode
     from sl_nerfstudio.processing.captures import describe_sequence, incomplete
+    from sl_nerfstudio.processing.frames import capture_sentences
 
     found = _photographs(config)
     decoder = None if config.camera_only else _decoder(config, found)
@@ -147,6 +148,8 @@ def read_inputs(config: CalibrateConfig, board: "Board") -> CalibrationInputs:
         )
     for fault in faults:
         print(f"not used: {fault}", flush=True)
+    for sentence in capture_sentences(captures.noted):
+        print(sentence, flush=True)
     layout = None if decoder is None else decoder.layout
     return CalibrationInputs(captures, found.size, None if layout is None else (layout.w, layout.h))
 

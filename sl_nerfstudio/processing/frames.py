@@ -332,14 +332,13 @@ def run_frame_stage_again(
     return [replace(r, resumed=resumed[r.name]) for r in run_frame_stage(config, job, captures)]
 
 
-def capture_sentences(results: Sequence[FrameStageResult]) -> list[str]:
-    """What the decoder noted, each note once with the frames that it is about."""
+def capture_sentences(noted: Sequence[tuple[str, Sequence[str]]]) -> list[str]:
+    """What the decoder noted on frames, by their names: each note once with the frames that it is about."""
     found: dict[str, list[str]] = {}
-    for result in results:
-        for note in result.notes:
-            found.setdefault(note, []).append(result.name)
-    whole = len(results)
-    return [f"{'all frames' if len(names) == whole else listed(names)}: {note}" for note, names in found.items()]
+    for name, notes in noted:
+        for note in notes:
+            found.setdefault(note, []).append(name)
+    return [f"{'all' if len(names) == len(noted) else listed(names)}: {note}" for note, names in found.items()]
 
 
 def describe_frame_stage(results: Sequence[FrameStageResult]) -> str:

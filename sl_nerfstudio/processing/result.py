@@ -366,7 +366,7 @@ def summarise(
             *([wrong] if wrong else []),
             *([found.doubt] if found and found.doubt else []),
             *(map(uncertainty_sentence, registration.uncertainties) if registration else ()),
-            *capture_sentences(results),
+            *capture_sentences([(result.name, result.notes) for result in results]),
         ),
         recapture=what_to_recapture(frames, records, not config.unordered),
         joint_px=None if adjusted is None else _both_known(adjusted.median_before_px, adjusted.median_after_px),

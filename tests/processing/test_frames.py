@@ -12,7 +12,6 @@ import tempfile
 import time
 import weakref
 from contextlib import redirect_stdout
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +20,8 @@ import pytest
 from sl_nerfstudio.cli.process import main
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing import frames, records
-from sl_nerfstudio.processing.captures import CapturedFrame, find_captures
+from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.frames import (
-    FrameStageResult,
     FrameWorker,
     capture_sentences,
     clouds_of,
@@ -307,7 +305,6 @@ def test_no_more_processes_are_started_than_there_is_memory_for(monkeypatch, meg
 
 
 def test_what_the_decoder_noted_is_said_once_with_its_frames():
-    frames = [FrameStageResult(CapturedFrame(f"f{k}", ()), notes=("decoded to 4 px",) * (k > 0)) for k in range(3)]
-    frames[1] = replace(frames[1], notes=("decoded to 4 px", "overexposed"))
-    assert capture_sentences(frames) == ["f1, f2: decoded to 4 px", "f1: overexposed"]
-    assert capture_sentences(frames[1:]) == ["all frames: decoded to 4 px", "f1: overexposed"]
+    noted = [("f0", ()), ("f1", ("decoded to 4 px", "overexposed")), ("f2", ("decoded to 4 px",))]
+    assert capture_sentences(noted) == ["f1, f2: decoded to 4 px", "f1: overexposed"]
+    assert capture_sentences(noted[1:]) == ["all: decoded to 4 px", "f1: overexposed"]
