@@ -20,6 +20,7 @@ from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import ShownImage
 from sl_nerfstudio.processing.cache import StageStore, work_folder
+from sl_nerfstudio.processing.captures import describe_faults
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent, registered_only
 from sl_nerfstudio.processing.frames import (
@@ -202,7 +203,7 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     inputs = read_inputs(config)
     captures, decoder = inputs.captures, inputs.job.decoder.name
     log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
-    for sentence in inputs.notes.sentences:
+    for sentence in (*inputs.notes.sentences, *(f"left out: {fault}" for fault in describe_faults(captures))):
         log(sentence)
     frames = _calibrate(config, inputs, make_report, log)
     wrong = _wrong_intrinsics(inputs, frames, log)

@@ -14,7 +14,7 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.calibration.stated import describe_change
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.frames import FrameStageResult, clouds_of
+from sl_nerfstudio.processing.frames import FrameStageResult, capture_sentences, clouds_of
 from sl_nerfstudio.processing.inputs import CaptureNotes
 from sl_nerfstudio.processing.object_only import ObjectOnly, object_document
 from sl_nerfstudio.processing.projector import FoundProjector
@@ -366,6 +366,7 @@ def summarise(
             *([wrong] if wrong else []),
             *([found.doubt] if found and found.doubt else []),
             *(map(uncertainty_sentence, registration.uncertainties) if registration else ()),
+            *capture_sentences([(result.name, result.notes) for result in results]),
         ),
         recapture=what_to_recapture(frames, records, not config.unordered),
         joint_px=None if adjusted is None else _both_known(adjusted.median_before_px, adjusted.median_after_px),
