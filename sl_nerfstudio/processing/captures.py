@@ -1,19 +1,21 @@
 """The photographs of each frame, and the Gray-code sequence that they show."""
 
+import math
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32, Float64, Int64
+from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoder import DecodingError
-from sl_nerfstudio.decoding.decoders import GrayCodeDecoder
-from sl_nerfstudio.decoding.gray_code import check_count
-from sl_nerfstudio.decoding.gray_code_order import layout_of_images, possible_layouts, with_numbering
+from sl_nerfstudio.decoding.gray_code import check_count, decode_gray_code, take_samples
+from sl_nerfstudio.decoding.gray_code_order import check_order, layout_of_images, possible_layouts, with_numbering
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.gray_code import GrayCode
@@ -270,15 +272,117 @@ def likely_layout(captures: Captures, name: SequenceName) -> GrayCode:
             "give the projector's resolution, as --pattern 1024x768, or the pattern.json of what was projected",
         )
     reached = np.zeros(2)
-    largest = GrayCode.in_order(name, *(2**bits for bits in fitting[-1].bits))
-    for frame in whole[:_LOOKED_AT]:
+    for _, cells in _cells_of(whole, fitting[-1], 1):
+        reached = np.maximum(reached, _reach(cells))
+    return next((layout for layout in fitting if layout.w >= reached[0] and layout.h >= reached[1]), fitting[-1])
+
+
+def _cells_of(
+    frames: Sequence[CapturedFrame], layout: GrayCode, step: int
+) -> Iterator[tuple[CapturedFrame, Float32[ndarray, "h w 2"]]]:
+    """Place in cells of every `step`th pixel of the first frames, whatever their bits say; NaN where not decoded."""
+    columns, rows = (2**bits for bits in layout.bits)
+    largest = GrayCode(columns, rows, 1, layout.shown)
+    for frame in frames[:_LOOKED_AT]:
         try:
-            decoded = GrayCodeDecoder(largest).decode(frame.images)
+            images = [np.ascontiguousarray(read_photograph(path)[::step, ::step]) for path in frame.images]
+            if check_order(take_samples(images), largest).misplaced:
+                continue
+            yield frame, decode_gray_code(images, largest).coords
         except (DecodingError, FileError):
             continue  # said when this frame is read
-        codes = decoded.coords[decoded.decoded]
-        reached = np.maximum(reached, np.quantile(codes, 1 - _BEYOND, axis=0)) if len(codes) else reached
-    return next((layout for layout in fitting if layout.w >= reached[0] and layout.h >= reached[1]), fitting[-1])
+
+
+def _reach(cells: Float32[ndarray, "h w 2"]) -> Float64[ndarray, "2"]:
+    """How far the cells of a frame reach, but for misread ones."""
+    return np.nanquantile(cells.reshape(-1, 2), 1 - _BEYOND, axis=0)
+
+
+# Whether the pattern has the stated resolution: by cells that it cannot have, and by where its edge is.
+
+_IMPOSSIBLE = 5e-3  # share of a frame's decoded pixels beyond the edge that no misreading explains
+_SIDE = 800  # pixels of a photograph's longer side that are looked at
+_BANDS, _FEWEST_BANDS = 16, 6  # along an edge, that are compared
+_STRAIGHT = 0.75  # share of the bands in which the pattern must end at the same cell
+_LARGEST_CELL = 32
+_NEAR = 0.03  # distance of an edge from where a resolution has it, as a share: the camera may see it coarsely
+_MOST_LIKELY = 3  # resolutions that are named
+
+
+def _require_resolution(captures: Captures, layout: GrayCode) -> None:
+    """Raise FileError if the captures show that the projector has another resolution than that of `layout`.
+
+    Cells beyond the stated ones cannot be. Cells that are missing tell where the edge of the pattern is seen: all rows
+    end at the same column.
+    """
+    bits_only = [axis for axis in (0, 1) if layout.bit_images(axis) and not layout.sines(axis)]
+    if len(bits_only) < 2:
+        return
+    whole = captures.require_whole()
+    w, h = captures.size
+    stated = np.array([layout.columns, layout.rows])
+    for frame, cells in _cells_of(whole, layout, max(1, max(w, h) // _SIDE)):
+        known = cells[np.isfinite(cells).all(-1)]
+        beyond = (known > stated + 0.5).mean(0) > _IMPOSSIBLE
+        centred = (2 ** np.array(layout.bits) - stated) / 2  # by programs that count from the middle
+        low = np.quantile(known, _BEYOND, axis=0)
+        beyond &= ~((low > centred - 1) & (known < centred + stated + 1).all(0)) | (centred == 0)
+        edge = np.array([_edge(known, axis) for axis in (0, 1)])
+        missing = edge < (1 - _NEAR) * stated - 1.5
+        if not beyond.any() and not missing.all():
+            continue
+        reach = np.where(np.isfinite(edge), edge, np.ceil(_reach(cells))).astype(int)
+        likely = _likely_resolutions(layout, reach, edge)
+        if beyond.any():
+            cannot = (
+                f"which {layout.w} x {layout.h} pixels cannot have ({stated[0]} x {stated[1]} cells of {layout.cell})"
+            )
+        elif likely:
+            cannot = f"where it ends, and {layout.w} x {layout.h} pixels have {stated[0]} x {stated[1]} cells"
+        else:
+            continue  # something else than the edge of the pattern may have a straight border
+        cause = (
+            "--pattern gives another resolution than that of the projector, or of the window that showed the pattern"
+        )
+        size = f"--pattern {likely[0].split()[0]}" if likely else "the resolution of the projector"
+        raise FileError(
+            frame.images[0].parent,
+            f"shows {reach[0]} columns and {reach[1]} rows of cells, {cannot}",
+            cause + (f"; likely: {' or '.join(likely)}" if likely else ""),
+            f"give {size}, or the pattern.json of what was projected",
+        )
+
+
+def _edge(known: Float32[ndarray, "n 2"], axis: int) -> float:
+    """The cell at which the pattern ends along an axis, in most bands of the other; NaN if its edge is not seen."""
+    other = known[:, 1 - axis]
+    band = np.clip((_BANDS * (other - other.min()) / max(float(np.ptp(other)), 1e-9)).astype(int), 0, _BANDS - 1)
+    ends = [np.quantile(known[band == k, axis], 0.99) for k in range(_BANDS) if (band == k).sum() >= _BANDS]
+    if len(ends) < _FEWEST_BANDS:
+        return math.nan
+    end = float(np.quantile(ends, 0.75))
+    return float(round(end)) if np.mean(np.abs(np.array(ends) - end) < 1) >= _STRAIGHT else math.nan
+
+
+def _likely_resolutions(layout: GrayCode, reach: Int64[ndarray, "2"], edge: Float64[ndarray, "2"]) -> list[str]:
+    """Usual resolutions whose sequences have as many bits and room for these cells, "640x480 (cells of 2)".
+
+    Where the edge of the pattern is seen, theirs must be there; the nearest and the smallest come first.
+    """
+    found = []
+    for w, h in STANDARD:
+        for cell in range(1, min(_LARGEST_CELL, h // 2) + 1):
+            other = GrayCode(w, h, cell)
+            beyond = np.array([other.columns, other.rows]) - reach
+            far = np.where(np.isfinite(edge), np.abs(beyond) / reach, 0.0)
+            if (
+                other.bits == layout.bits
+                and (beyond >= -1).all()
+                and far.max() < _NEAR
+                and (w, h) != (layout.w, layout.h)
+            ):
+                found.append((round(far.max(), 2), cell, f"{w}x{h} (cells of {cell})"))
+    return [text for *_, text in sorted(found)[:_MOST_LIKELY]]
 
 
 # The sequence of a Gray code that another program showed: by its name, by the images, or both.
@@ -343,7 +447,7 @@ def recognise_sequence(
     """The sequence that the captures show, for a projector of `size`; frames with faults are not looked at.
 
     Sequences that differ only where no image could tell are one. Raises UserError with the frame's folder if its images
-    fit no known sequence, or more than one, and if two frames show different ones.
+    fit no known sequence, or more than one, if two frames show different ones, and if the projector has another size.
     """
     whole = captures.require_whole()
     found: dict[GrayCode, Path] = {}
@@ -373,4 +477,6 @@ def recognise_sequence(
             f"{second.cell})\n    cause:  the folders hold captures of several sequences\n"
             "    remedy: process them separately, or name the sequence with --sequence"
         )
-    return replace(next(iter(found)), centred=centred)
+    layout = replace(next(iter(found)), centred=centred)
+    _require_resolution(captures, layout)
+    return layout

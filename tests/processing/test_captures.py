@@ -1,7 +1,9 @@
 """Captures are found in their order and with their pattern; faulty ones are named with all their faults."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -135,8 +137,6 @@ def config(tmp_path, **changes):
 
 
 def test_the_order_is_recognised_and_reported(tmp_path, sequence):
-    from pathlib import Path
-
     for name in ("a", "b"):
         write(tmp_path / "images" / name, sequence)
     captured = read_captured(config(tmp_path, pattern=Path("320x240"), intrinsics=tmp_path / "i.yml"))
@@ -202,3 +202,40 @@ def test_a_video_of_gray_code_is_refused(tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"x")
     with pytest.raises(UserError, match=r"v.mp4: is a video, and Gray code needs one image for each pattern"):
         read_captured(config(tmp_path, images=tmp_path / "v.mp4", pattern=tmp_path / "p.json"))
+
+
+def flat(size, part):
+    """Exact coordinates of a board tilted before the projector, from `part` shares of each side to one less of it."""
+    x, y = np.meshgrid(np.linspace(-0.08, 1.08, 260), np.linspace(-0.08, 1.08, 220))
+    u, v = size[0] * (x + 0.04 * (y - 0.5)), size[1] * (y - 0.03 * (x - 0.5))
+    coords = np.stack([u, v], -1)
+    low, high = np.multiply(size, part), np.multiply(size, 1 - part)
+    coords[((coords < low) | (coords > high)).any(-1)] = np.nan
+    return coords
+
+
+WRONG = [((640, 480, 2), "800x600"), ((640, 480, 2), "640x400"), ((1280, 800, 4), "1024x768")]
+
+
+@pytest.mark.parametrize(("true", "stated"), WRONG)
+def test_a_resolution_that_the_codes_exclude_is_refused_and_the_likely_one_named(tmp_path, true, stated):
+    layout = GrayCode(*true)
+    for name in ("a", "b"):
+        write(tmp_path / "images" / name, photographs(flat(true[:2], 0), layout=layout))
+    given = config(tmp_path, intrinsics=tmp_path / "i.yml")
+    with pytest.raises(UserError, match=f"--pattern {true[0]}x{true[1]}, or the pattern.json") as caught:
+        read_captured(replace(given, pattern=Path(stated)))
+    said = str(caught.value)
+    assert str(tmp_path / "images" / "a") in said and f"{stated.replace('x', ' x ')} pixels" in said
+    columns, rows = map(int, re.search(r"shows (\d+) columns and (\d+) rows of cells", said).groups())
+    assert layout.columns - 3 <= columns <= layout.columns and layout.rows - 3 <= rows <= layout.rows
+    captured = read_captured(replace(given, pattern=Path(f"{true[0]}x{true[1]}")))
+    assert captured.decoder.layout == layout
+
+
+def test_a_board_in_part_of_the_pattern_says_nothing_against_the_resolution(tmp_path):
+    layout = GrayCode(640, 480, 2)
+    for name in ("a", "b"):
+        write(tmp_path / "images" / name, photographs(flat((640, 480), 0.2), layout=layout))
+    given = config(tmp_path, pattern=Path("640x480"), intrinsics=tmp_path / "i.yml")
+    assert read_captured(given).decoder.layout == layout
