@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import track
+from sl_nerfstudio.console import command, next_steps, phase, say, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.layout import SequenceName
 
@@ -133,7 +133,7 @@ def read_inputs(config: CalibrateConfig, board: "Board") -> CalibrationInputs:
     found = _photographs(config)
     decoder = None if config.camera_only else _decoder(config, found)
     if decoder is not None and isinstance(decoder.layout, GrayCode):
-        print(describe_sequence(decoder.layout), flush=True)
+        say(describe_sequence(decoder.layout))
         found = found.with_faults(incomplete(found, decoder.layout))
     poses = [BoardPhotographs(frame.name, frame.images) for frame in found.frames if frame.name not in found.faults]
     captures = read_board_captures(poses, board, decoder, track)
@@ -146,7 +146,7 @@ def read_inputs(config: CalibrateConfig, board: "Board") -> CalibrationInputs:
             f"    remedy: capture 10 poses, tilted to all sides, near and far, all over the image\n{listed}".rstrip()
         )
     for fault in faults:
-        print(f"not used: {fault}", flush=True)
+        say(f"not used: {fault}")
     layout = None if decoder is None else decoder.layout
     return CalibrationInputs(captures, found.size, None if layout is None else (layout.w, layout.h))
 
@@ -174,9 +174,7 @@ def _decoder(config: CalibrateConfig, found: "Captures") -> "Decoder[Any]":
 
     if config.pattern is None:
         layout = likely_layout(found, config.sequence or "opencv")
-        print(
-            f"projector: taken to have {layout.w} x {layout.h} pixels; if not, say so as --pattern 1024x768", flush=True
-        )
+        say(f"projector: taken to have {layout.w} x {layout.h} pixels; if not, say so as --pattern 1024x768")
         return choose_decoder(layout, None, config.images)
     size = resolution(config.pattern)
     if size is not None:
@@ -219,23 +217,25 @@ def require_determined(found: "BoardCalibration") -> None:
 def calibrate_devices(config: CalibrateConfig) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     config.check()
-    board = config.the_board()
-    from sl_nerfstudio.calibration.board import MARK, calibrate, encode_calibration
-    from sl_nerfstudio.console import track
-    from sl_nerfstudio.evaluation.report.capture_reports import TITLE, render_calibration_report
-    from sl_nerfstudio.review.verdict import judge_calibration
-    from sl_nerfstudio.storage import held_results, write_atomic
+    with phase("start"):
+        board = config.the_board()
+        from sl_nerfstudio.calibration.board import MARK, calibrate, encode_calibration
+        from sl_nerfstudio.evaluation.report.capture_reports import TITLE, render_calibration_report
+        from sl_nerfstudio.review.verdict import judge_calibration
+        from sl_nerfstudio.storage import held_results, write_atomic
 
     report = config.output.with_suffix(".html")
     with held_results({config.output: MARK, report: TITLE}):
-        inputs = read_inputs(config, board)
-        found = calibrate(
-            inputs.captures.views, board, inputs.camera_size, inputs.pattern_size, config.projector_model, track
-        )
-        require_determined(found)
+        with phase("read"):
+            inputs = read_inputs(config, board)
+        with phase("calibrate"):
+            found = calibrate(
+                inputs.captures.views, board, inputs.camera_size, inputs.pattern_size, config.projector_model, track
+            )
+            require_determined(found)
         verdict = judge_calibration(found)
-        command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-        page = render_calibration_report(found, inputs.captures, verdict, next_pose_words(found), command)
+        called = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+        page = render_calibration_report(found, inputs.captures, verdict, next_pose_words(found), called)
         write_atomic(config.output, encode_calibration(found, verdict.band, verdict.reasons))
         write_atomic(report, page.encode())
     _print_summary(config, found, verdict, next_pose_words(found))

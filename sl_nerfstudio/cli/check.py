@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import unit_word
+from sl_nerfstudio.console import phase, unit_word
 
 if TYPE_CHECKING:
     from sl_nerfstudio.review.agreement import CrossFrameAgreement
@@ -72,22 +72,27 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
     Args:
         folder: The scan folder, which holds transforms.json; or a run's folder or its config.yml.
     """
-    if is_run(folder):
-        sys.stdout.write(check_run_folder(folder))
-        return
+    with phase("check"):
+        said = check_run_folder(folder) if is_run(folder) else check_scan_folder(folder)
+    sys.stdout.write(said)
+
+
+def check_scan_folder(folder: Path) -> str:
+    """What the scan is, and how its frames agree. Raises ScanError with everything that is wrong."""
     from sl_nerfstudio.errors import ScanError
     from sl_nerfstudio.scan.check import check_folder
 
     result = check_folder(folder)
     if result.faults:
         raise ScanError(result.faults, str(folder))
-    from sl_nerfstudio.review.agreement import compare_scan_frames, shared_surface_of_scan
-
     scan, said = result.scan, ""
     if scan is not None:
-        cross = compare_scan_frames(scan, scan.poses, [frame.pose_sigma for frame in scan.frames])
-        said = agreement(result, cross, shared_surface_of_scan(scan).decoded)
-    sys.stdout.write(summary(result) + said)
+        with phase("comparing the frames"):
+            from sl_nerfstudio.review.agreement import compare_scan_frames, shared_surface_of_scan
+
+            cross = compare_scan_frames(scan, scan.poses, [frame.pose_sigma for frame in scan.frames])
+            said = agreement(result, cross, shared_surface_of_scan(scan).decoded)
+    return summary(result) + said
 
 
 def agreement(result: "FolderCheck", cross: "CrossFrameAgreement", shared_decoded: Sequence[float | None]) -> str:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import figure, paragraph, unit_word
+from sl_nerfstudio.console import figure, paragraph, phase, unit_word
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -230,23 +230,26 @@ def evaluate_scan(config: EvalConfig) -> None:
 
 
 def _evaluate(config: EvalConfig) -> None:
-    from sl_nerfstudio.evaluation.evaluate import evaluate, measure_lengths, read_inputs, typical_sigma
-    from sl_nerfstudio.evaluation.judgement import judge, to_json, trained_steps
-    from sl_nerfstudio.evaluation.report.scan_report import ResidualThumbnails, intrinsics_hint
-    from sl_nerfstudio.storage import write_atomic
+    with phase("read"):
+        from sl_nerfstudio.evaluation.evaluate import evaluate, measure_lengths, read_inputs, typical_sigma
+        from sl_nerfstudio.evaluation.judgement import judge, to_json, trained_steps
+        from sl_nerfstudio.evaluation.report.scan_report import ResidualThumbnails, intrinsics_hint
+        from sl_nerfstudio.storage import write_atomic
 
-    pairs = _pairs(config)
-    inputs = read_inputs(config.mesh, config.data, config.poses, config.reference, config.samples, config.seed)
-    lengths = measure_lengths(pairs, inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
+        pairs = _pairs(config)
+        inputs = read_inputs(config.mesh, config.data, config.poses, config.reference, config.samples, config.seed)
     thumbnails = ResidualThumbnails()
-    evaluation = evaluate(
-        inputs.mesh, inputs.scan, inputs.poses, inputs.reference, inputs.true_poses, config.f_distances,
-        config.samples, config.seed, on_frame=thumbnails if config.report else None, sigma=inputs.stated_sigma,
-        true_units=inputs.true_units,
-    )  # fmt: skip
+    with phase("measure"):
+        lengths = measure_lengths(pairs, inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
+        evaluation = evaluate(
+            inputs.mesh, inputs.scan, inputs.poses, inputs.reference, inputs.true_poses, config.f_distances,
+            config.samples, config.seed, on_frame=thumbnails if config.report else None, sigma=inputs.stated_sigma,
+            true_units=inputs.true_units,
+        )  # fmt: skip
+        sigma = typical_sigma(inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
+    with phase("advise"):
+        capture = _next_capture(evaluation, inputs)
     hint, steps = intrinsics_hint(inputs.training, inputs.scan), trained_steps(inputs.training)
-    capture = _next_capture(evaluation, inputs)
-    sigma = typical_sigma(inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
     judgement = judge(evaluation, hint, steps, capture, inputs.unplaced, sigma, inputs.departed)
     results: dict[Path, str] = {}
     if config.json:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 
 from sl_nerfstudio.cli.run import load_run, run
-from sl_nerfstudio.console import command, fitted, next_steps, short_path, unit_word
+from sl_nerfstudio.console import command, fitted, next_steps, phase, short_path, unit_word
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -483,7 +483,11 @@ def export(config: ExportConfig) -> None:
         if config.pose_folder is not None:
             held.enter_context(locked(config.pose_folder))
         check_outputs(config)  # again: a process that held them until now may have written them
-        print(export_trained(load_run(config.load_config, config.data), config))
+        with phase("load"):
+            trained = load_run(config.load_config, config.data)
+        with phase("export"):
+            said = export_trained(trained, config)
+    print(said)
 
 
 def export_trained(trained: "TrainedRun", config: ExportConfig) -> str:

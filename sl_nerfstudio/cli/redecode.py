@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from sl_nerfstudio.cli.run import load_run, run
-from sl_nerfstudio.console import command, next_steps
+from sl_nerfstudio.console import command, next_steps, phase
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -43,7 +43,11 @@ def main() -> None:
 def redecode(arguments: RedecodeArguments) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     check(arguments)
-    print(redecode_trained(load_run(arguments.load_config, arguments.data), arguments))
+    with phase("load"):
+        trained = load_run(arguments.load_config, arguments.data)
+    with phase("decode"):
+        said = redecode_trained(trained, arguments)
+    print(said)
 
 
 def check(arguments: RedecodeArguments) -> None:

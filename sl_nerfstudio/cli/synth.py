@@ -7,7 +7,7 @@ from typing import Annotated
 import tyro
 
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import command, fitted, next_steps
+from sl_nerfstudio.console import command, fitted, next_steps, phase
 from sl_nerfstudio.synthesis.config import SynthConfig
 
 
@@ -31,17 +31,15 @@ def main() -> None:
 def _synthesise() -> None:
     arguments = tyro.cli(SynthArguments, prog="sl-synth", config=(tyro.conf.OmitArgPrefixes,))
     arguments.config.check()
-    # slow to import: torch, open3d
-    from sl_nerfstudio.synthesis.boards import BOARDS, write_board_captures
-    from sl_nerfstudio.synthesis.synthesise import synthesise
+    with phase("render"):
+        # slow to import: torch, open3d
+        from sl_nerfstudio.synthesis.boards import BOARDS, write_board_captures
+        from sl_nerfstudio.synthesis.synthesise import synthesise
 
-    if arguments.config.scene in BOARDS:
-        write_board_captures(arguments.config, arguments.output)
-        print(f"wrote {arguments.config.frames} poses of a board to {arguments.output}")
-        return
-    synthesise(arguments.config, arguments.output)
-    print(f"wrote {arguments.config.frames} frames to {arguments.output}")
-    print(_next(arguments.output, arguments.config))
+        board = arguments.config.scene in BOARDS
+        (write_board_captures if board else synthesise)(arguments.config, arguments.output)
+    print(f"wrote {arguments.config.frames} {'poses of a board' if board else 'frames'} to {arguments.output}")
+    print(_next_of_board(arguments.output, arguments.config) if board else _next(arguments.output, arguments.config))
 
 
 def _next(output: Path, config: SynthConfig) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.console import track
+from sl_nerfstudio.console import phase, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.object_separation.separate import Part
@@ -22,6 +22,14 @@ from sl_nerfstudio.pattern.layout import ShownImage
 from sl_nerfstudio.processing.cache import StageStore, work_folder
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent, registered_only
+from sl_nerfstudio.processing.earlier_runs import (
+    WrittenScan,
+    digest_of_captures,
+    note_scan,
+    note_work,
+    with_kept_work,
+    written_scan,
+)
 from sl_nerfstudio.processing.frames import (
     FrameJob,
     FrameStageResult,
@@ -194,28 +202,62 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
     in the work folder.
     """
     config.check()
-    with NewFolder(config.output) as folder, work_folder(config.work_folder):
-        return _process(config, folder, make_report, log)
+    own, config = config.work_folder, with_kept_work(config)
+    if config.work_folder != own:
+        log(f"these captures were processed before: {config.work_folder} has what was kept of that")
+    earlier = written_scan(config)
+    renewed = () if earlier is None else tuple(earlier.files)
+    with NewFolder(config.output, renewed) as folder, work_folder(config.work_folder):
+        return _process(config, folder, earlier, make_report, log)
 
 
-def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, log: Log) -> ProcessResult:
-    inputs = read_inputs(config)
-    captures, decoder = inputs.captures, inputs.job.decoder.name
-    log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
-    for sentence in inputs.notes.sentences:
-        log(sentence)
-    frames = _calibrate(config, inputs, make_report, log)
-    wrong = _wrong_intrinsics(inputs, frames, log)
-    given = inputs.given and inputs.given.chosen([result.cloud is not None for result in frames.results])
-    frames, registration = _register(config, inputs, frames, given, log)
-    _require_registered(config, inputs, frames.results, registration, wrong, make_report)
-    frames, consistent = _adjust(config, inputs, frames, registration, log)
+def _process(
+    config: ProcessConfig, folder: NewFolder, earlier: WrittenScan | None, make_report: MakeReport, log: Log
+) -> ProcessResult:
+    with phase("read"):
+        inputs = read_inputs(config)
+        note_work(config)
+        captures, decoder = inputs.captures, inputs.job.decoder.name
+        log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
+        for sentence in inputs.notes.sentences:
+            log(sentence)
+        digest = digest_of_captures(captures)
+        if earlier is not None:
+            earlier.require_same(digest, config.output)
+            log(f"{config.output} holds an earlier scan of the same captures, which this one replaces")
+    with phase("decode"):
+        frames = _calibrate(config, inputs, make_report, log)
+        wrong = _wrong_intrinsics(inputs, frames, log)
+    with phase("register"):
+        given = inputs.given and inputs.given.chosen([result.cloud is not None for result in frames.results])
+        frames, registration = _register(config, inputs, frames, given, log)
+        _require_registered(config, inputs, frames.results, registration, wrong, make_report)
+    with phase("adjust"):
+        frames, consistent = _adjust(config, inputs, frames, registration, log)
+    with phase("write"):
+        result = _write(config, inputs, frames, consistent, given, wrong, folder, make_report, log)
+        note_scan(config, folder, digest)
+    return result
+
+
+def _write(
+    config: ProcessConfig,
+    inputs: Inputs,
+    frames: CalibratedFrames,
+    consistent: ConsistentFrames,
+    given: GivenPoses | None,
+    wrong: str,
+    folder: NewFolder,
+    make_report: MakeReport,
+    log: Log,
+) -> ProcessResult:
+    """Judge the adjusted frames, and write the scan with its report."""
     registration, adjusted = consistent.registration, within_stated_doubt(consistent.adjusted, frames.job.stated)
     poses = find_scan_poses(clouds_of(frames.results), registration, adjusted, inputs.known, given)
     shares = _surface_shares(frames.job, frames.results, registration, adjusted.poses)
     result = summarise(
         config,
-        decoder,
+        inputs.job.decoder.name,
         frames.results,
         registration,
         poses,
@@ -225,12 +267,12 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
         wrong,
         frames.notes,
     )
+    if result.joint_px is not None:
+        log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
     if config.object_only:
         parts = find_object_only(frames.job, frames.results, registration, poses)
         log("object only: " + "\n    ".join(object_sentences(parts)))
         poses, result = with_usable_scale(poses, parts), with_object_only(result, parts)
-    if result.joint_px is not None:
-        log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
     write_scan(folder, frames.job, frames.results, poses, result, make_report)
     return result
 

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, SelfCalibration
-from sl_nerfstudio.console import track
+from sl_nerfstudio.console import phase, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
@@ -382,7 +382,8 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     surface = build_surface(model, settings)
     mesh, scan, poses = surface.marked.mesh, model.scan, model.poses()
     joint = model.joint_covariance()
-    quality = vertex_uncertainty(mesh, scan, poses, joint, model.cell)
+    with phase("uncertainty of the vertices"):
+        quality = vertex_uncertainty(mesh, scan, poses, joint, model.cell)
     colours = vertex_colours(mesh, scan, poses)
     invented = quality.views == 0 if settings.keep_unobserved else surface.marked.invented
     properties = VertexProperties(quality, invented, None if colours is None else colours.rgb)
@@ -393,12 +394,14 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
         write_device_files(settings, model, mesh, properties.colour)
     whole, decimated, textured = mesh, None, None
     if settings.target_faces is not None:
-        decimated = decimate(mesh, settings.target_faces)
+        with phase("fewer triangles"):
+            decimated = decimate(mesh, settings.target_faces)
         mesh, properties = decimated.mesh, properties.chosen(decimated.nearest).moved(decimated.distance)
     if settings.watertight:
         _require_closed(mesh, settings)
     if settings.texture is not None:
-        textured = surface_texture(mesh, settings.texture, whole, scan, poses)
+        with phase("laying the mesh out flat"):
+            textured = surface_texture(mesh, settings.texture, whole, scan, poses)
     write_mesh(settings.mesh, mesh, properties, scan.units, None if textured is None else textured.texture)
     if settings.pose_folder is not None:
         _write_poses(settings.pose_folder / TRANSFORMS, model)
