@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import parse
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.console import command, next_steps, phase, say, track
 from sl_nerfstudio.errors import UserError
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from sl_nerfstudio.decoding.decoder import Decoder
     from sl_nerfstudio.pattern.boards import Board
     from sl_nerfstudio.processing.captures import Captures
-    from sl_nerfstudio.review.verdict import Verdict
+    from sl_nerfstudio.review.verdict import Help, Verdict
 
 # The flags of sl-calibrate.
 
@@ -106,6 +105,12 @@ class CalibrateConfig:
             raise UserError(f"--{' --'.join(_FLAGS[self.board])}: {error}") from error
 
 
+_GROUPS = {
+    "the board": ("board", "corners", "squares", "square", "marker", "dictionary"),
+    "the projector": ("pattern", "sequence", "projector_model", "camera_only"),
+}
+
+
 # What the flags of sl-calibrate name: photographs, the pattern on them, and the corners of the board.
 
 Size = tuple[int, int]
@@ -184,6 +189,10 @@ def _decoder(config: CalibrateConfig, found: "Captures") -> "Decoder[Any]":
 
 # What sl-calibrate says about its result.
 
+_HELP: "dict[Help, str]" = {
+    "boards": "add poses, tilted to all sides, near and far, and run the same sl-calibrate again"
+}
+
 
 def next_pose_words(found: "BoardCalibration") -> str:
     """The further pose that would help most, as a sentence."""
@@ -233,7 +242,7 @@ def calibrate_devices(config: CalibrateConfig) -> None:
                 inputs.captures.views, board, inputs.camera_size, inputs.pattern_size, config.projector_model, track
             )
             require_determined(found)
-        verdict = judge_calibration(found)
+        verdict = judge_calibration(found).with_help(_HELP)
         called = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
         page = render_calibration_report(found, inputs.captures, verdict, next_pose_words(found), called)
         write_atomic(config.output, encode_calibration(found, verdict.band, verdict.reasons))
@@ -256,15 +265,14 @@ def _print_summary(config: CalibrateConfig, found: "BoardCalibration", verdict: 
         print(f"  {reason}")
     print(next_pose)
     print(f"wrote {config.output}\nreport: {config.output.with_suffix('.html')}")
+    pattern = config.pattern or "pattern.json"
+    flags = ("--images", "captures", "--pattern", pattern, "--intrinsics", config.output, "--output", "scan")
+    print(next_steps([command("sl-process", *flags, *(["--estimate-projector"] if config.camera_only else []))]))
 
 
 def main() -> None:
     """Entry point of the command."""
-    run(
-        lambda: calibrate_devices(
-            tyro.cli(CalibrateConfig, prog="sl-calibrate", config=(tyro.conf.FlagCreatePairsOff,))
-        )
-    )
+    run(lambda: calibrate_devices(parse(CalibrateConfig, "sl-calibrate", ("images", "pattern"), _GROUPS)))
 
 
 if __name__ == "__main__":

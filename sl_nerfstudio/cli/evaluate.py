@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from sl_nerfstudio.cli.arguments import parse
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.console import figure, paragraph, phase, unit_word
 from sl_nerfstudio.errors import UserError
@@ -69,7 +70,9 @@ def _surface(evaluation: "Evaluation", sigma: "Sequence[PoseSigma | None]") -> s
     if not known:
         return "no truth is known, and the poses do not state their uncertainty"
     lengths, turns = [s.camera_translation for s in known], [s.camera_rotation_deg for s in known]
-    return f"no truth is known; cameras to {_rms(lengths):.2g} {evaluation.units}, {_rms(turns):.2g}° (1 sigma)"
+    return (
+        f"no truth is known; cameras to {_rms(lengths):.2g} {unit_word(evaluation.units)}, {_rms(turns):.2g}° (1 sigma)"
+    )
 
 
 def _worst_frame(evaluation: "Evaluation") -> str:
@@ -203,7 +206,7 @@ class EvalConfig:
     """Where to write the report, one HTML file that needs no network."""
     reference: Path | None = None
     """Compare with this instead of ground_truth/mesh.ply: a mesh, or points in an .npz file under the key `xyz`."""
-    f_distances: Annotated[tuple[float, ...], tyro.conf.arg(metavar="D [D ...]")] = ()
+    f_distances: Annotated[tuple[float, ...], tyro.conf.arg(metavar="D ..")] = ()
     """Distances for the F-score, in the scan's unit; default: four round ones from 0.1 % to 1 % of the truth's size."""
     distance: Annotated[tuple[str, ...], tyro.conf.arg(metavar='"P Q"')] = ()
     """Distances to measure, each between two points of the surface: "12.5,-3,40 10,2,38" (x,y,z in the unit and axes of
@@ -216,6 +219,13 @@ class EvalConfig:
     """Random seed of these points; the same seed gives the same figures."""
     verbose: bool = False
     """Also print tables of all distances, pose errors and residuals."""
+
+
+_INPUTS = ("mesh", "data", "poses", "reference", "distances")
+_GROUPS = {
+    "what is compared": ("poses", "reference", "distance", "distances", "f_distances"),
+    "what is written": ("json", "report", "verbose"),
+}
 
 
 def evaluate_scan(config: EvalConfig) -> None:
@@ -232,7 +242,7 @@ def evaluate_scan(config: EvalConfig) -> None:
 def _evaluate(config: EvalConfig) -> None:
     with phase("read"):
         from sl_nerfstudio.evaluation.evaluate import evaluate, measure_lengths, read_inputs, typical_sigma
-        from sl_nerfstudio.evaluation.judgement import judge, to_json, trained_steps
+        from sl_nerfstudio.evaluation.judgement import further_commands, judge, to_json, trained_steps
         from sl_nerfstudio.evaluation.report.scan_report import ResidualThumbnails, intrinsics_hint
         from sl_nerfstudio.storage import write_atomic
 
@@ -250,7 +260,9 @@ def _evaluate(config: EvalConfig) -> None:
     with phase("advise"):
         capture = _next_capture(evaluation, inputs)
     hint, steps = intrinsics_hint(inputs.training, inputs.scan), trained_steps(inputs.training)
-    judgement = judge(evaluation, hint, steps, capture, inputs.unplaced, sigma, inputs.departed)
+    judgement = judge(
+        evaluation, hint, steps, capture, inputs.unplaced, sigma, inputs.departed, further_commands(inputs.training)
+    )
     results: dict[Path, str] = {}
     if config.json:
         document = to_json(evaluation, judgement.verdict, capture, lengths)
@@ -317,7 +329,7 @@ def _check(config: EvalConfig) -> None:
 
 def main() -> None:
     """Entry point of `sl-eval`."""
-    run(lambda: evaluate_scan(tyro.cli(EvalConfig, prog="sl-eval")))
+    run(lambda: evaluate_scan(parse(EvalConfig, "sl-eval", _INPUTS, _GROUPS)))
 
 
 if __name__ == "__main__":

@@ -7,8 +7,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import flag_name, parse
 from sl_nerfstudio.cli.run import load_run, run
 from sl_nerfstudio.console import command, fitted, next_steps, phase, short_path, unit_word
 from sl_nerfstudio.errors import UserError
@@ -83,7 +82,7 @@ class ExportConfig:
             value = getattr(self, field.name)
             if field.default is not MISSING and value == field.default:
                 continue
-            words.append(f"--{field.name.replace('_', '-')}")
+            words.append(flag_name(field.name))
             if not isinstance(value, bool):
                 words += map(str, value if isinstance(value, tuple) else (value,))
         return words
@@ -109,6 +108,14 @@ class ExportConfig:
             cameras=self.cameras,
             trajectories=self.trajectory,
         )
+
+
+_GROUPS = {
+    "the surface": ("resolution", "object_only", "largest_component", "keep_unobserved", "fill_holes", "watertight"),
+    "for other programs": ("target_faces", "texture", "points", "cameras", "trajectory"),
+    "poses": ("poses",),
+    "files": ("data", "overwrite"),
+}
 
 
 # What is wrong with the flags of sl-export, found before anything slow; all of it at once.
@@ -468,7 +475,7 @@ def _rms(values: "ndarray") -> float:
 
 def main() -> None:
     """Entry point of the command."""
-    run(lambda: export(tyro.cli(ExportConfig, prog="sl-export", config=(tyro.conf.FlagCreatePairsOff,))))
+    run(lambda: export(parse(ExportConfig, "sl-export", ("load_config", "data"), _GROUPS)))
 
 
 def export(config: ExportConfig) -> None:

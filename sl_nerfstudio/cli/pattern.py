@@ -6,8 +6,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import flag_name, parse
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.layout import SequenceName
@@ -275,13 +274,31 @@ class PatternArguments:
         return self.shown_kind in ("chessboard", "charuco")
 
 
+_HELP_GROUPS = {
+    "patterns to project": (
+        "kind",
+        "preset",
+        "width",
+        "height",
+        "period",
+        "line_width",
+        "gap",
+        "seed",
+        "cell",
+        "sequence",
+    ),
+    "boards to print": ("corners", "squares", "square", "marker", "dictionary", "print_width"),
+    "on a display": ("show", "every"),
+}
+
+
 def main() -> None:
     """Entry point of the command."""
     run(_write)
 
 
 def _write() -> None:
-    arguments = tyro.cli(PatternArguments, prog="sl-pattern")
+    arguments = parse(PatternArguments, "sl-pattern", groups=_HELP_GROUPS)
     _check(arguments)
     if arguments.show is not None:
         _show(arguments, arguments.show)
@@ -332,9 +349,9 @@ def _check(arguments: PatternArguments) -> None:
     fitting = ("output", "kind", *_FLAGS[kind], *(() if arguments.is_board else ("show", "every")))
     for field in fields(arguments):
         if field.name not in fitting and getattr(arguments, field.name) is not None:
-            own = ", ".join(_flag(name) for name in fitting[2:])
+            own = ", ".join(flag_name(name) for name in fitting[2:])
             raise UserError(
-                f"{_flag(field.name)}: has no meaning for --kind {kind}\n"
+                f"{flag_name(field.name)}: has no meaning for --kind {kind}\n"
                 f"    cause:  the flag belongs to another kind of pattern\n    remedy: leave it out; flags are {own}"
             )
     if arguments.every is not None and (arguments.show is None or not 0 < arguments.every < float("inf")):
@@ -343,10 +360,6 @@ def _check(arguments: PatternArguments) -> None:
         raise UserError(f"--seed {arguments.seed}: seeds are at least 0")
     if arguments.print_width is not None and not 0 < arguments.print_width < float("inf"):
         raise UserError(f"--print-width {arguments.print_width:g}: give a width in millimetres above 0")
-
-
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
 
 
 if __name__ == "__main__":

@@ -3,8 +3,7 @@
 import sys
 from typing import TYPE_CHECKING
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import parse
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.console import command, next_steps, phase, say
 from sl_nerfstudio.processing.config import ProcessConfig
@@ -13,13 +12,23 @@ if TYPE_CHECKING:
     from sl_nerfstudio.processing.result import ProcessResult
 
 
+_INPUTS = ("images", "pattern", "intrinsics", "projector_intrinsics", "masks", "poses")
+_GROUPS = {
+    "devices": ("intrinsics", "projector_intrinsics", "projector_model", "procam_step", "rig", "estimate_projector"),
+    "captures": ("decoder", "sequence", "cell", "unordered", "not_mosaic"),
+    "lengths and poses": ("known_length", "poses", "no_adjust"),
+    "what is used of the pictures": ("masks", "object_only"),
+    "this run": ("work", "jobs", "seed"),
+}
+
+
 def main() -> None:
     """Entry point of the command."""
     run(_process)
 
 
 def _process() -> None:
-    config = tyro.cli(ProcessConfig, prog="sl-process", config=(tyro.conf.FlagCreatePairsOff,))
+    config = parse(ProcessConfig, "sl-process", _INPUTS, _GROUPS)
     config.check()
     with phase("start"):
         from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report

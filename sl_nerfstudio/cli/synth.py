@@ -2,10 +2,8 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import parse, require_paths
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.console import command, fitted, next_steps, phase
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -20,7 +18,17 @@ class SynthArguments:
 
     output: Path
     """folder to write; it must be new or empty"""
-    config: Annotated[SynthConfig, tyro.conf.arg(name="")] = field(default_factory=SynthConfig)
+    config: SynthConfig = field(default_factory=SynthConfig)
+
+
+_GROUPS = {
+    "the scene": ("scene", "appearance", "background", "units"),
+    "the devices": ("path", "frames", "resolution", "pattern", "projector_model", "camera_distortion",
+                    "projector_distortion", "supersampling", "sensor_noise"),
+    "errors of the decoded coordinates and of the poses": ("noise", "missing", "wrong", "pose_error",
+                                                           "autocalibration_error", "clean"),
+    "what is written": ("images_only", "scale_known", "pose_sigma", "world_turn", "seed"),
+}  # fmt: skip
 
 
 def main() -> None:
@@ -29,7 +37,9 @@ def main() -> None:
 
 
 def _synthesise() -> None:
-    arguments = tyro.cli(SynthArguments, prog="sl-synth", config=(tyro.conf.OmitArgPrefixes,))
+    arguments = parse(SynthArguments, "sl-synth", groups=_GROUPS)
+    scene, pattern = Path(arguments.config.scene), arguments.config.pattern
+    require_paths({"--scene": scene if scene.suffix else None, "--pattern": pattern})
     arguments.config.check()
     with phase("render"):
         # slow to import: torch, open3d

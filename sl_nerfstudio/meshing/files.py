@@ -360,7 +360,7 @@ def write_points(
         raise UserError(
             f"{path}: not written, there is no point\n"
             "    cause:  no frame confirms any part of the surface\n"
-            "    remedy: check the scan with sl-check, and look at the run in ns-viewer"
+            "    remedy: train it to its last step; if that was done, find the poses anew with sl-process"
         )
     metres = UNITS[units] or 1.0
     if path.suffix.lower() == ".las":
@@ -422,7 +422,7 @@ def write_mesh(
         raise UserError(
             f"{path}: not written, {int((~np.isfinite(mesh.vertices)).any(1).sum())} vertices are not numbers\n"
             "    cause:  the training diverged, or the scan's poses are wrong\n"
-            "    remedy: check the scan with sl-check and train again"
+            "    remedy: train again; if it happens again, find the poses anew with sl-process"
         )
     placed = mesh.mapped(file_from_world(suffix, units))
     colour = None if properties is None else properties.colour

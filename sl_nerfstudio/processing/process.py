@@ -348,12 +348,12 @@ def register_clouds(
 ) -> tuple[tuple[int, ...], Registration]:
     """Which cloud of every frame, and the registration of these; every pair is tried if the order says nothing."""
     choice = choose_projectors(clouds, not unordered, seed)
-    registration = register(chosen_clouds(clouds, choice.chosen), not unordered, seed, start, log)
+    registration = register(chosen_clouds(clouds, choice.chosen), not unordered, seed, start)
     if not (unordered or registration.ordered):
         log("the frames do not follow each other in the order of capture: --unordered says so")
         before, choice = choice, choose_projectors(clouds, False, seed)  # they were compared with wrong neighbours
         if choice.chosen != before.chosen:
-            registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start, log)
+            registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start)
     return choice.chosen, without_undecided(registration, choice.undecided)
 
 

@@ -187,7 +187,7 @@ def test_a_scan_of_other_captures_stays_and_so_does_any_after_an_error(ramp_scan
     shutil.copytree(ramp_scan.root, tmp_path / "c")
     fewer = replace(resumed, images=tmp_path / "c" / "images", work=resumed.work_folder)
     shutil.rmtree(fewer.images / NAMES[2])
-    with pytest.raises(UserError, match="holds the scan of other captures(.|\n)*added, removed or replaced"):
+    with pytest.raises(UserError, match=r"holds the scan of other captures(.|\n)*added, removed or replaced"):
         run(fewer)
     monkeypatch.setattr(stages, "find_scan_poses", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
