@@ -117,6 +117,7 @@ class Phase:
     total: int | None = None
     note: str = ""
     result: str = ""
+    lines: list[str] = field(default_factory=list)  # of `say`, printed when the bar is gone
     _recent: deque[tuple[float, int]] = field(default_factory=deque)
 
     def update(self, done: int, total: int | None, note: str = "") -> None:
@@ -170,6 +171,8 @@ def phase(name: str) -> Iterator[Phase]:
             yield found
     finally:
         _phase = None
+        for line in found.lines:
+            print(line, flush=True)
     took = time.monotonic() - found.started
     if found.result:
         text = found.result + (f" ({duration(took)})" if "\n" not in found.result and took >= 1 else "")
@@ -177,11 +180,11 @@ def phase(name: str) -> Iterator[Phase]:
 
 
 def say(text: str) -> None:
-    """What the phase that runs has found; without one, a line of output, at once even if that is a file."""
-    if _phase is None:
+    """Print a line of output, at once even if that is a file; where a bar is shown, when its phase ends."""
+    if _phase is None or not sys.stderr.isatty():
         print(text, flush=True)
     else:
-        _phase.say(text)
+        _phase.lines.append(text)
 
 
 @contextmanager

@@ -165,5 +165,5 @@ def _missing(flag: str, path: Path) -> str:
     alike = difflib.get_close_matches(known.name, [name for name in names if not name.startswith(".")], 1)
     beside = f"; {known.parent / alike[0]} is there" if alike else ""
     where = "" if path.is_absolute() else f", which is relative to {Path.cwd()}"
-    problem = "does not exist" if known == path.absolute() else f"does not exist, nor does {known}"
+    problem = "there is no such file or folder" + ("" if known == path.absolute() else f", and no {known}")
     return f"{flag} {path}: {problem}\n    cause:  a typing error{beside}\n    remedy: correct the path{where}"

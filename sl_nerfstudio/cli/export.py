@@ -207,10 +207,10 @@ def _places(config: ExportConfig) -> Iterator[str]:
     devices = [path for paths in config.settings("arbitrary").device_files.values() for path in paths]
     files = [*files_of(config.output, config.texture is not None), *others, *config.pose_files, *devices]
     absolute = [path.absolute() for path in files]
+    if config.points is not None and absolute.count(config.points.absolute()) > 1:
+        yield f"--points {config.points}: is another output of this command\n    remedy: choose another name"
+        files = [path for path in files if path.absolute() != config.points.absolute()]
     for path in files:
-        if absolute.count(path.absolute()) > 1 and path == config.points:
-            yield f"--points {path}: is another output of this command\n    remedy: choose another name"
-            continue
         try:
             yield from _place(path, config.overwrite)
         except OSError as error:

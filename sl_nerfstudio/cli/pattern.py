@@ -1,13 +1,13 @@
 """sl-pattern: write a pattern to project or to print, and its description."""
 
 import io
-import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from sl_nerfstudio.cli.arguments import flag_name, parse
 from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.console import command, next_steps, phase
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.layout import SequenceName
 
@@ -108,24 +108,23 @@ def write_board(arguments: "PatternArguments") -> str:
     return (
         f"wrote a {description(board)} to {output}\n"
         f"print board.pdf at 100 % ({paper}), and measure its ruler: if it is not 100 mm long, multiply all lengths "
-        f"below by what it is / 100 mm\nglue the print to something flat, capture it from many sides, then run\n"
-        f"    {calibrate_command(board)}"
+        f"below by what it is / 100 mm\nglue the print to something flat, and capture it from many sides under a "
+        f"pattern (sl-pattern --kind gray-code)\n{next_steps([calibrate_command(board)])}"
     )
 
 
-def calibrate_command(board: "Board") -> str:
+def calibrate_command(board: "Board", images: Path | str = "captures", pattern: Path | str = "pattern.json") -> str:
     """The command that calibrates with captures of the board."""
     from sl_nerfstudio.pattern.boards import Chessboard
 
+    size, square = f"{board.columns}x{board.rows}", f"{board.square:g} mm"
     if isinstance(board, Chessboard):
-        flags = ["--board", "chessboard", "--corners", f"{board.columns}x{board.rows}"]
-        last = []
+        flags = ["--board", "chessboard", "--corners", size, "--square", square]
     else:
-        flags = ["--board", "charuco", "--squares", f"{board.columns}x{board.rows}"]
-        last = ["--marker", f'"{board.marker:g} mm"', "--dictionary", shlex.quote(board.dictionary)]
-    lengths = ["--square", f'"{board.square:g} mm"', *last]
-    end = ["--pattern", "pattern.json", "--output", "intrinsics.json"]
-    return " ".join(["sl-calibrate", "--images", "captures", *flags, *lengths, *end])
+        marker = ["--marker", f"{board.marker:g} mm", "--dictionary", board.dictionary]
+        flags = ["--board", "charuco", "--squares", size, "--square", square, *marker]
+    end = ["--pattern", pattern, "--output", "intrinsics.json"]
+    return command("sl-calibrate", "--images", images, *flags, *end)
 
 
 def _board(arguments: "PatternArguments") -> "Board":
@@ -302,10 +301,23 @@ def _write() -> None:
     _check(arguments)
     if arguments.show is not None:
         _show(arguments, arguments.show)
-    elif arguments.is_board:
-        print(write_board(arguments))
-    else:
-        print(write_pattern(arguments.output, _layout(arguments), arguments.print_width))
+        return
+    with phase("draw"):
+        if arguments.is_board:
+            said = write_board(arguments)
+        else:
+            written = write_pattern(arguments.output, _layout(arguments), arguments.print_width)
+            said = f"{written}\n{_next(arguments)}"
+    print(said)
+
+
+def _next(arguments: PatternArguments) -> str:
+    """Say how to go on with a pattern that is projected."""
+    captured = ("sl-capture", "--camera", 0, "--output", "captures", "--pattern", arguments.output / "pattern.json")
+    if arguments.shown_kind == "gray-code":
+        return next_steps([command(*captured, "--show", 1)])
+    shown = [] if arguments.print_width else [command("sl-pattern", "--output", arguments.output, "--show", 1)]
+    return next_steps([*shown, command(*captured)])
 
 
 def _layout(arguments: PatternArguments, display: tuple[int, int] | None = None) -> "PatternLayout":

@@ -25,7 +25,7 @@ _GROUPS = {
     "the scene": ("scene", "appearance", "background", "units"),
     "the devices": ("path", "frames", "resolution", "pattern", "projector_model", "camera_distortion",
                     "projector_distortion", "supersampling", "sensor_noise"),
-    "errors of the decoded coordinates and of the poses": ("noise", "missing", "wrong", "pose_error",
+    "errors of coordinates and poses": ("noise", "missing", "wrong", "pose_error",
                                                            "autocalibration_error", "clean"),
     "what is written": ("images_only", "scale_known", "pose_sigma", "world_turn", "seed"),
 }  # fmt: skip
@@ -49,7 +49,15 @@ def _synthesise() -> None:
         board = arguments.config.scene in BOARDS
         (write_board_captures if board else synthesise)(arguments.config, arguments.output)
     print(f"wrote {arguments.config.frames} {'poses of a board' if board else 'frames'} to {arguments.output}")
-    print(_next_of_board(arguments.output, arguments.config) if board else _next(arguments.output, arguments.config))
+    print(_next_of_board(arguments) if board else _next(arguments.output, arguments.config))
+
+
+def _next_of_board(arguments: SynthArguments) -> str:
+    from sl_nerfstudio.cli.pattern import calibrate_command
+    from sl_nerfstudio.synthesis.boards import BOARDS
+
+    images, pattern = arguments.output / "images", arguments.output / "pattern.json"
+    return next_steps([calibrate_command(BOARDS[arguments.config.scene], images, pattern)])
 
 
 def _next(output: Path, config: SynthConfig) -> str:

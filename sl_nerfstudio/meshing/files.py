@@ -6,6 +6,7 @@ unit, and its GLB takes sRGB colours of vertices for linear ones.
 
 import io
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -312,7 +313,9 @@ def encode_las(
 
     header = laspy.LasHeader(point_format=_PLAIN if properties.colour is None else _COLOURED, version="1.4")
     header.offsets = points_m.mean(0)
-    header.scales = np.full(3, max(float(np.ptp(points_m, axis=0).max()), 1e-9) / _STEPS)
+    finest = max(float(np.ptp(points_m, axis=0).max()), 1e-9) / _STEPS
+    header.scales = np.full(3, 10.0 ** math.ceil(math.log10(finest)))  # readers show so many decimals
+    header.offsets = np.round(header.offsets / header.scales) * header.scales
     quality = properties.quality
     extra: dict[str, tuple[type, ndarray]] = {f"n{axis}": (np.float32, normals[:, k]) for k, axis in enumerate("xyz")}
     extra |= {

@@ -234,6 +234,9 @@ def _process(
         _require_registered(config, inputs, frames.results, registration, wrong, make_report)
     with phase("adjust"):
         frames, consistent = _adjust(config, inputs, frames, registration, log)
+        both = consistent.adjusted.median_before_px, consistent.adjusted.median_after_px
+        if np.isfinite(both).all():
+            log("frames agree to {1:.2f} px, {0:.2f} px before".format(*both))
     with phase("write"):
         result = _write(config, inputs, frames, consistent, given, wrong, folder, make_report, log)
         note_scan(config, folder, digest)
@@ -267,8 +270,6 @@ def _write(
         wrong,
         frames.notes,
     )
-    if result.joint_px is not None:
-        log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
     if config.object_only:
         parts = find_object_only(frames.job, frames.results, registration, poses)
         log("object only: " + "\n    ".join(object_sentences(parts)))
