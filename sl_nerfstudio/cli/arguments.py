@@ -23,11 +23,11 @@ Groups = Mapping[str, Sequence[str]]
 """Titles of groups of flags, with the names of their fields."""
 
 
-def parse(kind: type[T], command: str, inputs: Sequence[str] = (), groups: Groups | None = None) -> T:
+def parse(kind: type[T], command: str, inputs: Mapping[str, str] | None = None, groups: Groups | None = None) -> T:
     """Read the command line into a dataclass, whose fields are the flags and whose docstrings explain them.
 
-    `inputs`: fields with paths that must exist. With --help, prints the help and exits. Raises UserError for paths that
-    lead nowhere, before anything slow is imported.
+    `inputs`: fields with paths that must exist, and what they should be. With --help, prints the help and exits. Raises
+    UserError for paths that lead nowhere, before anything slow is imported.
     """
     if {"-h", "--help"} & set(sys.argv[1:]):
         print(help_text(kind, command, groups or {}, shutil.get_terminal_size().columns))
@@ -35,7 +35,7 @@ def parse(kind: type[T], command: str, inputs: Sequence[str] = (), groups: Group
     import tyro
 
     found = tyro.cli(kind, prog=command, config=(tyro.conf.OmitArgPrefixes,))
-    require_paths({flag_name(name): getattr(found, name) for name in inputs})
+    require_paths({flag_name(name): (getattr(found, name), remedy) for name, remedy in (inputs or {}).items()})
     return found
 
 
@@ -139,22 +139,25 @@ def _values(hint: Any) -> str:
 
 # Paths that lead nowhere, named before the imports that take seconds.
 
+SCAN = "give the folder that holds transforms.json"
+CONFIG = "give the config.yml that ns-train prints at the end: outputs/SCAN/sl-neus/DATE/config.yml"
 
-def require_paths(paths: Mapping[str, Path | None]) -> None:
+
+def require_paths(paths: Mapping[str, tuple[Path | None, str]]) -> None:
     """Raise UserError that names every path that does not exist, by its flag, with what is there instead.
 
-    A pattern that is a resolution (1024x768) is no path.
+    Each path comes with what it should be. A pattern that is a resolution (1024x768) is no path.
     """
     faults = [
-        _missing(flag, path)
-        for flag, path in paths.items()
+        _missing(flag, path, remedy)
+        for flag, (path, remedy) in paths.items()
         if path is not None and not os.path.exists(path) and not re.fullmatch(r"\d+[xX×]\d+", str(path))
     ]
     if faults:
         raise UserError("\n".join(faults))
 
 
-def _missing(flag: str, path: Path) -> str:
+def _missing(flag: str, path: Path, remedy: str) -> str:
     known = path.absolute()
     while not os.path.isdir(known.parent):  # Path.is_dir raises for a name that is too long
         known = known.parent
@@ -162,8 +165,9 @@ def _missing(flag: str, path: Path) -> str:
         names = os.listdir(known.parent)
     except OSError:
         names = []
-    alike = difflib.get_close_matches(known.name, [name for name in names if not name.startswith(".")], 1)
-    beside = f"; {known.parent / alike[0]} is there" if alike else ""
-    where = "" if path.is_absolute() else f", which is relative to {Path.cwd()}"
+    alike = difflib.get_close_matches(known.name, [name for name in names if not name.startswith(".")], 1, 0.7)
+    cause = "a typing error" + ("" if path.is_absolute() else f", or another folder than {Path.cwd()}")
+    if alike:
+        cause = f"a typing error: {known.parent / alike[0]} is there"
     problem = "there is no such file or folder" + ("" if known == path.absolute() else f", and no {known}")
-    return f"{flag} {path}: {problem}\n    cause:  a typing error{beside}\n    remedy: correct the path{where}"
+    return f"{flag} {path}: {problem}\n    cause:  {cause}\n    remedy: {remedy}"

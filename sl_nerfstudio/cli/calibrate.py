@@ -105,6 +105,10 @@ class CalibrateConfig:
             raise UserError(f"--{' --'.join(_FLAGS[self.board])}: {error}") from error
 
 
+_INPUTS = {
+    "images": "give the folder with the captures of the board",
+    "pattern": "give the pattern.json that sl-pattern wrote, or the projector's resolution, as 1024x768",
+}
 _GROUPS = {
     "the board": ("board", "corners", "squares", "square", "marker", "dictionary"),
     "the projector": ("pattern", "sequence", "projector_model", "camera_only"),
@@ -272,7 +276,7 @@ def _print_summary(config: CalibrateConfig, found: "BoardCalibration", verdict: 
 
 def main() -> None:
     """Entry point of the command."""
-    run(lambda: calibrate_devices(parse(CalibrateConfig, "sl-calibrate", ("images", "pattern"), _GROUPS)))
+    run(lambda: calibrate_devices(parse(CalibrateConfig, "sl-calibrate", _INPUTS, _GROUPS)))
 
 
 if __name__ == "__main__":

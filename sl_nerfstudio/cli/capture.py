@@ -211,7 +211,9 @@ def capture(config: CaptureConfig) -> None:
     """Capture until it is ended, then say what to do next. Raises UserError for what cannot be captured."""
     config.check()
     if not config.camera.isdigit():
-        require_paths({"--camera": Path(config.camera)})
+        require_paths(
+            {"--camera": (Path(config.camera), "give the number of a camera (0 is the first), or a video file")}
+        )
     from sl_nerfstudio.capture.camera import open_camera
     from sl_nerfstudio.pattern.files import read_layout
     from sl_nerfstudio.pattern.gray_code import GrayCode
@@ -336,7 +338,11 @@ def _next_command(config: CaptureConfig) -> str:
 
 def main() -> None:
     """Entry point of the command."""
-    run(lambda: capture(parse(CaptureConfig, "sl-capture", ("pattern",), _GROUPS)))
+    run(
+        lambda: capture(
+            parse(CaptureConfig, "sl-capture", {"pattern": "give the pattern.json that sl-pattern wrote"}, _GROUPS)
+        )
+    )
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sl_nerfstudio.cli.arguments import parse, require_paths
+from sl_nerfstudio.cli.arguments import SCAN, parse, require_paths
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.console import phase, unit_word
 
@@ -80,7 +80,7 @@ def main() -> None:
 
 def check(folder: Path) -> None:
     """Do what the command line asks for. Raises UserError with everything that is wrong."""
-    require_paths({"DIR": folder})
+    require_paths({"DIR": (folder, SCAN)})
     with phase("check"):
         said = check_run_folder(folder) if is_run(folder) else check_scan_folder(folder)
     sys.stdout.write(said)

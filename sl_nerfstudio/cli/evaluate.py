@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from sl_nerfstudio.cli.arguments import parse
+from sl_nerfstudio.cli.arguments import SCAN, parse
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.console import figure, paragraph, phase, unit_word
 from sl_nerfstudio.errors import UserError
@@ -221,7 +221,13 @@ class EvalConfig:
     """Also print tables of all distances, pose errors and residuals."""
 
 
-_INPUTS = ("mesh", "data", "poses", "reference", "distances")
+_INPUTS = {
+    "mesh": "give the mesh that sl-export wrote",
+    "data": SCAN,
+    "poses": "give the transforms.json that sl-export --poses wrote",
+    "reference": "give a mesh, or an .npz file of points",
+    "distances": "give a text file with distances, one a line",
+}
 _GROUPS = {
     "what is compared": ("poses", "reference", "distance", "distances", "f_distances"),
     "what is written": ("json", "report", "verbose"),

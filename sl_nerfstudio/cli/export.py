@@ -7,7 +7,7 @@ from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sl_nerfstudio.cli.arguments import flag_name, parse
+from sl_nerfstudio.cli.arguments import CONFIG, SCAN, flag_name, parse
 from sl_nerfstudio.cli.run import load_run, run
 from sl_nerfstudio.console import command, fitted, next_steps, phase, short_path, unit_word
 from sl_nerfstudio.errors import UserError
@@ -475,7 +475,7 @@ def _rms(values: "ndarray") -> float:
 
 def main() -> None:
     """Entry point of the command."""
-    run(lambda: export(parse(ExportConfig, "sl-export", ("load_config", "data"), _GROUPS)))
+    run(lambda: export(parse(ExportConfig, "sl-export", {"load_config": CONFIG, "data": SCAN}, _GROUPS)))
 
 
 def export(config: ExportConfig) -> None:

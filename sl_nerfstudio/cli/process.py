@@ -12,7 +12,14 @@ if TYPE_CHECKING:
     from sl_nerfstudio.processing.result import ProcessResult
 
 
-_INPUTS = ("images", "pattern", "intrinsics", "projector_intrinsics", "masks", "poses")
+_INPUTS = {
+    "images": "give the folder with the captures",
+    "pattern": "give the pattern.json that sl-pattern wrote, or the projector's resolution, as 1024x768",
+    "intrinsics": "give the file with the intrinsics; sl-calibrate makes one",
+    "projector_intrinsics": "give the file with the intrinsics; sl-calibrate makes one",
+    "masks": "give the folder with one mask for each frame",
+    "poses": "give a transforms.json with rough poses",
+}
 _GROUPS = {
     "devices": ("intrinsics", "projector_intrinsics", "projector_model", "procam_step", "rig", "estimate_projector"),
     "captures": ("decoder", "sequence", "cell", "unordered", "not_mosaic"),

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sl_nerfstudio.cli.arguments import parse
+from sl_nerfstudio.cli.arguments import CONFIG, SCAN, parse
 from sl_nerfstudio.cli.run import load_run, run
 from sl_nerfstudio.console import command, next_steps, phase
 from sl_nerfstudio.errors import UserError
@@ -36,7 +36,7 @@ class RedecodeArguments:
 
 def main() -> None:
     """Entry point of the command."""
-    run(lambda: redecode(parse(RedecodeArguments, "sl-redecode", ("load_config", "data"))))
+    run(lambda: redecode(parse(RedecodeArguments, "sl-redecode", {"load_config": CONFIG, "data": SCAN})))
 
 
 def redecode(arguments: RedecodeArguments) -> None:

@@ -38,8 +38,10 @@ def main() -> None:
 
 def _synthesise() -> None:
     arguments = parse(SynthArguments, "sl-synth", groups=_GROUPS)
-    scene, pattern = Path(arguments.config.scene), arguments.config.pattern
-    require_paths({"--scene": scene if scene.suffix else None, "--pattern": pattern})
+    scene = Path(arguments.config.scene)
+    mesh = scene if scene.suffix else None
+    pattern = arguments.config.pattern, "give a pattern.json or an image"
+    require_paths({"--scene": (mesh, "give a mesh file, or the name of a scene (--help)"), "--pattern": pattern})
     arguments.config.check()
     with phase("render"):
         # slow to import: torch, open3d

@@ -121,7 +121,7 @@ def work_folder(root: Path) -> Iterator[None]:
                 _remove_oldest(folder)
 
 
-_MOST_KEPT = 8  # results of one stage, or of one frame: so many settings can be gone back to
+MOST_KEPT = 16  # results of one stage, or of one frame: so many can be gone back to
 
 
 def _remove_oldest(folder: Path) -> None:
@@ -130,5 +130,5 @@ def _remove_oldest(folder: Path) -> None:
     for path in folder.glob("*-*.npz"):
         alike.setdefault(path.name.rpartition("-")[0], []).append(path)
     for paths in alike.values():
-        for path in sorted(paths, key=lambda path: path.stat().st_mtime_ns)[:-_MOST_KEPT]:
+        for path in sorted(paths, key=lambda path: path.stat().st_mtime_ns)[:-MOST_KEPT]:
             path.unlink(missing_ok=True)

@@ -13,7 +13,7 @@ from sl_nerfstudio.processing.cache import FOLDER
 from sl_nerfstudio.processing.captures import Captures
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.scan.write import encode_json
-from sl_nerfstudio.storage import NewFolder, files_below, held_by_another, write_atomic
+from sl_nerfstudio.storage import LOCK, NewFolder, files_below, held_by_another, write_atomic
 
 # Which work folder a run uses: its own, or that of an earlier run with the same captures and another output. The user's
 # cache folder has a note of which captures were processed in which work folder; the results stay where they are.
@@ -118,6 +118,8 @@ def written_scan(config: ProcessConfig) -> WrittenScan | None:
         for name in set(there) - changed
         if hashlib.sha256((root / name).read_bytes()).hexdigest() != written.files[name]
     }
+    if changed and os.path.lexists(root / LOCK):
+        return None  # a run was killed while it renewed the scan: its list says what it leaves
     if changed:
         name = min(changed)
         what = "removed" if name not in there else "added" if name not in written.files else "changed"

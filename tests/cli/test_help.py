@@ -86,7 +86,10 @@ MISTYPED = {
     "sl-check": [["captrues"], ["captrues"]],
     "sl-export": [["--load-config", "nowhere/config.yml", "--output", "m.ply"], ["nowhere"]],
     "sl-eval": [["--mesh", "nowhere.ply", "--data", "captrues"], ["nowhere.ply", "captrues"]],
-    "sl-calibrate": [["--images", "captrues", "--pattern", "nowhere.json", "--output", "i.json"], ["captrues"]],
+    "sl-calibrate": [
+        ["--images", "captrues", "--pattern", "nowhere.json", "--output", "i.json"],
+        ["captrues", "nowhere.json"],
+    ],
     "sl-redecode": [["--load-config", "nowhere/config.yml", "--output", "o"], ["nowhere"]],
     "sl-capture": [["--camera", "nowhere.mp4", "--output", "o"], ["nowhere.mp4"]],
     "sl-synth": [["--scene", "nowhere.stl", "--output", "o"], ["nowhere.stl"]],
@@ -103,7 +106,7 @@ def test_paths_that_lead_nowhere_are_all_named_before_slow_imports(script, tmp_p
     assert all(
         f"{path}: there is no such file or folder" in result.stderr or f" {path}" in result.stderr for path in wrong
     )
-    assert result.stderr.startswith("error: ") and "remedy: correct the path, which is relative to" in result.stderr
+    assert result.stderr.startswith("error: ") and result.stderr.count("remedy: give ") == len(wrong)
     assert ("captures is there" in result.stderr) == ("captrues" in flags)
     assert [path.name for path in tmp_path.iterdir()] == ["captures"]
 

@@ -14,7 +14,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
 from sl_nerfstudio.processing import frames
 from sl_nerfstudio.processing import process as stages
-from sl_nerfstudio.processing.cache import VERSIONS
+from sl_nerfstudio.processing.cache import MOST_KEPT, VERSIONS
 from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.process import process
 from sl_nerfstudio.processing.records import digest
@@ -164,6 +164,13 @@ def test_another_length_renews_the_scan_and_another_output_uses_what_is_kept(who
     run(replace(resumed, output=tmp_path / "elsewhere" / "t"))  # of which the same work folder knows
 
 
+def test_killed_while_a_scan_is_renewed_the_next_run_succeeds(whole, resumed):
+    run(replace(resumed, known_length="baseline of frame 1 = 10 cm"))
+    assert sum(killed(resumed, moment) for moment in (1, 8, 20, 31, 45)) >= 3
+    run(resumed)
+    assert content(resumed.output) == content(whole / "s")
+
+
 @pytest.mark.parametrize(
     ("change", "cause"),
     [
@@ -202,7 +209,7 @@ def test_the_work_folder_keeps_what_was_used_last(resumed):
         path.touch()
         os.utime(path, (k, k))
     run(resumed)
-    assert [path for path in old if path.exists()] == old[-7:]  # and the one that was used
+    assert [path for path in old if path.exists()] == old[1 - MOST_KEPT :]  # and the one that was used
 
 
 def test_temporary_files_of_killed_workers_do_not_stay(resumed):
