@@ -433,6 +433,7 @@ class NewFolder:
             foreign = _foreign(self.root, [*left, *self._earlier])
             if foreign is not None:
                 raise _not_empty(self.root, foreign, self._lock)
+            left = [path for path in left if path not in self._earlier]  # of which nothing is gone yet
             _remove(self.root, left)
             if left:
                 print(f"{self.root}: removed what {self._lock.left_by} had not finished", file=sys.stderr)
