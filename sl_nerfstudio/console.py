@@ -234,6 +234,7 @@ def track(iterable: Iterable[T], description: str, total: int | None = None) -> 
     with nullcontext(_phase) if _phase is not None else phase(description) as shown:
         before = shown.done, shown.total, shown.note
         note = "" if description == shown.name else description.lower()
+        shown.update(0, total, note)  # the first item may take long
         for done, item in enumerate(iterable):
             shown.update(done, total, note)
             yield item
