@@ -303,8 +303,9 @@ def judge(
     ]  # fmt: skip
     if evaluation.reference is not None and evaluation.alignment in evaluation.surface:
         figures.insert(0, _accuracy(evaluation))
-    bad = [f for f in figures if f.band in ("acceptable", "poor")]
-    reasons = [Reason(f.band, f"{f.name}: {f.text} (good: {f.good}); {f.advice}") for f in bad]
+    reasons = [
+        Reason(f.band, f"{f.name}: {f.text} (good: {f.good}); {f.advice}") for f in figures if f.band != "unknown"
+    ]
     reasons += [Reason("acceptable", f"{f.name}: cannot be judged; {f.advice}") for f in figures if f.band == "unknown"]
     names = [frame.name for frame in evaluation.agreement.frames]
     if evaluation.cross is not None:

@@ -1,7 +1,7 @@
 """The flags of `sl-process`; the docstrings of the fields are their help text."""
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -113,7 +113,3 @@ class ProcessConfig:
         """The folder in which results of stages are kept."""
         output = self.output if self.output.name not in ("", "..") else Path(os.path.abspath(self.output))
         return self.work or output.parent / f"{output.name}.work"
-
-    def with_work(self, work: Path) -> "ProcessConfig":
-        """The same with another work folder."""
-        return replace(self, work=work)

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,7 @@ def with_kept_work(config: ProcessConfig) -> ProcessConfig:
     noted = _noted_work().get(os.path.realpath(config.images))
     if noted is None or not Path(noted, FOLDER).is_dir() or held_by_another(Path(noted)):
         return config
-    return config.with_work(Path(noted))
+    return replace(config, work=Path(noted))
 
 
 def note_work(config: ProcessConfig) -> None:
