@@ -350,7 +350,7 @@ def normalisation(scan: Scan, samples: PixelSamples) -> Similarity:
             f"{scan.root / 'transforms.json'}: only {len(points)} of {tried} pixels have a camera ray and a projector "
             "ray that meet in front of both devices. The poses are probably world-to-device instead of "
             "device-to-world, or in OpenCV axes (multiply them by diag(1, -1, -1, 1) from the right), or coords/ has "
-            "x and y swapped. Run sl-check on the folder."
+            "x and y swapped. sl-process finds poses and coordinates from the photographs."
         )
     centre, radius = enclosing_sphere(without_lonely(points))
     scale = OBJECT_RADIUS / radius

@@ -265,6 +265,13 @@ def _with_length(scheduler: SchedulerConfig | None, steps: int) -> SchedulerConf
     return scheduler
 
 
+_FIRST = ("data", "output_dir", "experiment_name", "timestamp", "max_num_iterations", "load_dir", "load_config",
+          "schedule_iterations", "verbose", "cuda_graph", "tf32", "pipeline")  # fmt: skip
+_fields = SLTrainerConfig.__dataclass_fields__
+# --help shows fields in their order: those that users of this method set come before the rest of nerfstudio's
+SLTrainerConfig.__dataclass_fields__ = {name: _fields[name] for name in (*_FIRST, *_fields)}
+
+
 def default_device() -> Literal["cpu", "cuda"]:
     """`cuda` where torch can use a GPU, else `cpu`."""
     return "cuda" if torch.cuda.is_available() else "cpu"

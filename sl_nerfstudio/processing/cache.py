@@ -2,7 +2,7 @@
 
 import platform
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -82,6 +82,8 @@ class StageStore:
         path = self._folder / f"{' '.join(filter(None, (stage, frame)))}-{key[:KEY_LENGTH]}.npz"
         stored = _stored(path)
         if stored is not None and stored[0] == key:
+            with suppress(OSError):
+                path.touch()  # used: not among the oldest
             self._log(f"{stage}: kept from an earlier run")
             return stored[1]
         content = encode((key, compute()))
@@ -116,3 +118,17 @@ def work_folder(root: Path) -> Iterator[None]:
         finally:
             for folder in folders:
                 remove_partial(folder)
+                _remove_oldest(folder)
+
+
+MOST_KEPT = 16  # results of one stage, or of one frame: so many can be gone back to
+
+
+def _remove_oldest(folder: Path) -> None:
+    """Keep the results that were made or used last; those of one stage or frame differ by the key in their names."""
+    alike: dict[str, list[Path]] = {}
+    for path in folder.glob("*-*.npz"):
+        alike.setdefault(path.name.rpartition("-")[0], []).append(path)
+    for paths in alike.values():
+        for path in sorted(paths, key=lambda path: path.stat().st_mtime_ns)[:-MOST_KEPT]:
+            path.unlink(missing_ok=True)

@@ -4,6 +4,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from io import BytesIO
 from pathlib import Path
@@ -50,6 +51,8 @@ class DecodedStore:
         content = read_checked(self._path(frame, key))
         if content is None:
             return None
+        with suppress(OSError):
+            self._path(frame, key).touch()  # used: not among the oldest
         try:
             with np.load(BytesIO(content), allow_pickle=False) as stored:
                 coords, mask, pattern = stored["coords"], stored["mask"], stored["pattern"]

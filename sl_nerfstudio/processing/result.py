@@ -36,7 +36,7 @@ from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind
 from sl_nerfstudio.review.agreement import CrossFrameAgreement, SurfaceShares
 from sl_nerfstudio.review.moving_part import MovingPart, in_one_place
-from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, ScanFacts, Verdict, judge_scan, listed
+from sl_nerfstudio.review.verdict import FrameFacts, Help, PairFacts, ScanFacts, Verdict, judge_scan, listed
 
 # Sentences for what relative pose estimation and registration found out about frames.
 
@@ -230,7 +230,19 @@ def without_empty(frames: Sequence[FrameRecord], found: ObjectOnly) -> tuple[Fra
     )
 
 
-# What to capture again, and why.
+# What helps against each reason of the verdict, and what to capture again, and why.
+
+HELP: dict[Help, str] = {
+    "again": "capture these views again, and run the same sl-process with them",
+    "between": "capture views in between, and run the same sl-process with them",
+    "light": "focus better, with more light from the projector and less from the room, capture it again, and run the "
+    "same sl-process",
+    "nearer": "hold the projector farther from the camera, show parts at other depths, and run the same sl-process",
+    "poses": "calibrate both devices again with sl-calibrate, and run sl-process with the new intrinsics",
+    "adjust": "run the same sl-process without --no-adjust",
+    "intrinsics": "calibrate again with sl-calibrate, or train with ns-train sl-neus --data SCAN "
+    "--pipeline.model.refine-intrinsics True",
+}
 
 _LOW_RATE = 0.6  # decoded share of the pattern
 _SMALL_SHARE = 0.03  # of the image that shows the pattern
@@ -393,7 +405,7 @@ def summarise(
                 moving is not None and moving.registered,
                 adjusted=not config.no_adjust,
             )
-        ),
+        ).with_help(HELP),
         projector=found,
         contradiction=wrong,
         object_only=parts,
