@@ -57,7 +57,7 @@ class RegisteredFramesSettings:
     """What moves: every device, frames with one relative pose for all, or frames under one projector that stays."""
     projector: ProjectorKnowledge | None = None
     """Uncertainty of a projector that was found from the captures; None: that of any calibration."""
-    adjustment: AdjustmentSettings = field(default_factory=lambda: AdjustmentSettings(lost_by_surface=False))
+    adjustment: AdjustmentSettings = field(default_factory=lambda: AdjustmentSettings(further_searches=False))
     """The bundle adjustment itself; surfaces were registered before."""
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment import adjust as adjustment
-from sl_nerfstudio.bundle_adjustment import observations
+from sl_nerfstudio.bundle_adjustment import modes, observations
 from sl_nerfstudio.bundle_adjustment.adjust import (
     Adjustment,
     CrossValidation,
@@ -21,12 +21,12 @@ from sl_nerfstudio.bundle_adjustment.adjust import (
     adjust,
     cross_validate,
     find_minimum,
-    mean_and_error,
     with_other_minima,
 )
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
-from sl_nerfstudio.bundle_adjustment.covariance import departure_of
+from sl_nerfstudio.bundle_adjustment.modes import departure_of
 from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, constrained
+from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.geometry.lie import exp_se3, fit_similarity, inverse, log_so3
@@ -210,7 +210,7 @@ def test_frames_that_slide_on_a_plane_have_a_sigma_that_covers_their_error(monke
     true, maps = rig_of(FEW, SIZE), noisy_maps(0, 0.02)
     one = find_minimum(disturbed(true, 0), maps, TIGHT, "known-rig", SEVERAL)
     several = with_other_minima(one)
-    assert torch.equal(one.rig.T_world_camera, several.rig.T_world_camera) and several.searched is None
+    assert torch.equal(one.rig.T_world_camera, several.rig.T_world_camera) and several.explored is None
     assert with_other_minima(several) is several
     error = departure_of(true, one.rig)[: 6 * FEW]
     rms = [float((error / f.covariance.diagonal()[: 6 * FEW].sqrt()).pow(2).mean().sqrt()) for f in (one, several)]
@@ -224,7 +224,8 @@ def test_frames_that_slide_on_a_plane_have_a_sigma_that_covers_their_error(monke
 def searches(monkeypatch) -> list:
     """All searches, in order."""
     begun, search = [], adjustment.search
-    monkeypatch.setattr(adjustment, "search", lambda *a: begun.append(a) or search(*a))
+    for module in (adjustment, modes):
+        monkeypatch.setattr(module, "search", lambda *a: begun.append(a) or search(*a))
     return begun
 
 
