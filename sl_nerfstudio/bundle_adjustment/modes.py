@@ -16,7 +16,8 @@ from functools import partial
 from math import exp, log
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
+from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import moved_together
@@ -61,6 +62,7 @@ _SHAKE_STEPS = 6  # most of those steps
 _MOST_FRAMES = 100  # beyond which no further search is made: it takes time, and many frames hold each other
 _LEAST_WEIGHT = 1e-4  # of an end, relative to the result, that is worth saying
 _BARRIER = 20.0  # nats that the posterior falls between two modes: errors of look-ups make small ones everywhere
+_BENT = 5.0  # times the noise, by which look-ups may be off half-way
 _TURNED = 0.5  # share of the largest rotation from which a frame counts as turned
 
 
@@ -73,6 +75,11 @@ class Mode:
     frames: tuple[int, ...]
     angle_deg: float
     axis: tuple[float, float, float]  # of the turn, in the scene's axes
+
+    def turned(self, R: Float64[ndarray, "3 3"]) -> "Mode":
+        """In other axes, to which a rotation leads."""
+        x, y, z = (R @ self.axis).tolist()
+        return replace(self, axis=(x, y, z))
 
 
 @dataclass(frozen=True)
@@ -175,7 +182,8 @@ def with_others(
     """The covariance's factor, wider by what other ends in the same valley differ, and the modes beyond it.
 
     Further searches begin at poses as uncertain as the starting ones, which are their prior, if the result, shaken,
-    does not lead back. Ends in its valley count by what look-ups say, as it may be within its error. Frames that no search has placed are passed over.
+    does not lead back. Ends in its valley count by what look-ups say, as it may be within its error. Frames that no
+    search has placed are passed over.
     """
     problem, rig, noise = found.problem, found.rig, found.best.noise
     if not (problem.settings.other_minima and found.may_differ):
@@ -202,10 +210,10 @@ def with_others(
 
 
 def _apart(problem: SearchProblem, one: Rig, two: Rig, noise: float) -> bool:
-    """Whether the look-ups say that frames are not half-way between two rigs."""
+    """Whether the look-ups say that frames are not half-way between two rigs, nor near there: valleys are bent."""
     half = departure_of(two, one).reshape(2, -1, 6) / 2
     middle = one.moved(half[0], half[1])
-    said = [odds(problem, end, middle, noise) for end in (one, two)]
+    said = (odds(problem, end, middle, _BENT * noise) for end in (one, two))
     return all(found.data > max(_BARRIER, found.error) for found in said)
 
 

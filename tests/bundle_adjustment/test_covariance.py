@@ -41,7 +41,7 @@ from .analytic import images_of, matrix_by_kind, prior_of, rig_of, without_gauge
 FRAMES, SIZE, SCANS = 4, 100, 10
 SIGMAS = (0.03, radians(1.0), 0.01, radians(0.3))
 PRIOR = prior_of(FRAMES, *SIGMAS, intrinsics=0.0)
-SETTINGS = AdjustmentSettings(anchors_per_frame=150, frames_per_anchor=3, max_iterations=8, other_minima=0)
+SETTINGS = AdjustmentSettings(anchors_per_frame=150, frames_per_anchor=3, max_iterations=8, other_minima=False)
 MODES = ("free", "rigid-rig", "known-rig", "static-projector")
 
 

@@ -41,7 +41,7 @@ from . import analytic
 from .analytic import ExactMaps, disturbed, images_of, prior_of, rig_of, rough_prior, turned, turns_deg
 
 FRAMES, SIZE, LOST = 6, 100, 2
-SETTINGS = AdjustmentSettings(anchors_per_frame=100, frames_per_anchor=3, max_iterations=20, other_minima=0)
+SETTINGS = AdjustmentSettings(anchors_per_frame=100, frames_per_anchor=3, max_iterations=20, other_minima=False)
 
 ASKED = replace(SETTINGS, other_minima=True)
 
