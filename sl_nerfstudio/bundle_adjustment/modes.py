@@ -62,6 +62,7 @@ _SHAKE_STEPS = 6  # most of those steps
 _MOST_FRAMES = 100  # beyond which no further search is made: it takes time, and many frames hold each other
 _LEAST_WEIGHT = 1e-4  # of an end, relative to the result, that is worth saying
 _BARRIER = 20.0  # nats that the posterior falls between two modes: errors of look-ups make small ones everywhere
+_LEAST_TURN_DEG = 5.0  # of a frame, from which an end may be a mode of its own
 _BENT = 5.0  # times the noise, by which look-ups may be off half-way
 _TURNED = 0.5  # share of the largest rotation from which a frame counts as turned
 
@@ -212,6 +213,8 @@ def with_others(
 def _apart(problem: SearchProblem, one: Rig, two: Rig, noise: float) -> bool:
     """Whether the look-ups say that frames are not half-way between two rigs, nor near there: valleys are bent."""
     half = departure_of(two, one).reshape(2, -1, 6) / 2
+    if float(torch.rad2deg(2 * half[0, :, 3:].norm(dim=1).max())) < _LEAST_TURN_DEG:
+        return False
     middle = one.moved(half[0], half[1])
     said = (odds(problem, end, middle, _BENT * noise) for end in (one, two))
     return all(found.data > max(_BARRIER, found.error) for found in said)
