@@ -129,6 +129,7 @@ def read_inputs(config: CalibrateConfig, board: "Board") -> CalibrationInputs:
     from sl_nerfstudio.calibration.board_captures import BoardPhotographs, read_board_captures
     from sl_nerfstudio.pattern.gray_code import GrayCode
     from sl_nerfstudio.processing.captures import describe_sequence, incomplete
+    from sl_nerfstudio.processing.frames import capture_sentences
 
     found = _photographs(config)
     decoder = None if config.camera_only else _decoder(config, found)
@@ -147,17 +148,19 @@ def read_inputs(config: CalibrateConfig, board: "Board") -> CalibrationInputs:
         )
     for fault in faults:
         print(f"not used: {fault}", flush=True)
+    for sentence in capture_sentences(captures.noted):
+        print(sentence, flush=True)
     layout = None if decoder is None else decoder.layout
     return CalibrationInputs(captures, found.size, None if layout is None else (layout.w, layout.h))
 
 
 def _photographs(config: CalibrateConfig) -> "Captures":
     """Poses in sub-folders; for the camera alone, also single images."""
+    from sl_nerfstudio.calibration.board import FEWEST_VIEWS
     from sl_nerfstudio.processing.captures import find_captures
 
-    if config.camera_only and any(path.is_file() for path in _content(config)):
-        return find_captures(config.images, sequences=False)
-    return find_captures(config.images, sequences=True)
+    single = config.camera_only and any(path.is_file() for path in _content(config))
+    return find_captures(config.images, not single, needs=f"a calibration needs {FEWEST_VIEWS} poses at least")
 
 
 def _content(config: CalibrateConfig) -> list[Any]:
@@ -177,11 +180,13 @@ def _decoder(config: CalibrateConfig, found: "Captures") -> "Decoder[Any]":
         print(
             f"projector: taken to have {layout.w} x {layout.h} pixels; if not, say so as --pattern 1024x768", flush=True
         )
-        return choose_decoder(layout, None, config.images)
+        return choose_decoder(layout, None, config.images, config.sequence is not None)
     size = resolution(config.pattern)
-    if size is not None:
-        return choose_decoder(recognise_sequence(found, size, config.sequence, None), None, config.pattern)
-    return choose_decoder(layout_in_order(config.pattern, config.sequence), None, config.pattern)
+    if size is None:
+        layout = layout_in_order(config.pattern, config.sequence)
+    else:
+        layout = recognise_sequence(found, size, config.sequence, None)
+    return choose_decoder(layout, None, config.pattern, config.sequence is not None)
 
 
 # What sl-calibrate says about its result.

@@ -1,8 +1,10 @@
 """`sl-check DIR`: every fault of a scan folder at once, or those of a training run."""
 
+import math
 import sys
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -82,26 +84,37 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
     if result.faults:
         raise ScanError(result.faults, str(folder))
     from sl_nerfstudio.review.agreement import compare_scan_frames, shared_surface_of_scan
+    from sl_nerfstudio.review.moving_part import moving_share
 
     scan, said = result.scan, ""
     if scan is not None:
         cross = compare_scan_frames(scan, scan.poses, [frame.pose_sigma for frame in scan.frames])
-        said = agreement(result, cross, shared_surface_of_scan(scan).decoded)
+        said = agreement(result, cross, shared_surface_of_scan(scan).decoded, moving_share(scan))
     sys.stdout.write(summary(result) + said)
 
 
-def agreement(result: "FolderCheck", cross: "CrossFrameAgreement", shared_decoded: Sequence[float | None]) -> str:
+def agreement(
+    result: "FolderCheck",
+    cross: "CrossFrameAgreement",
+    shared_decoded: Sequence[float | None],
+    moving: float | None = None,
+) -> str:
     """What the coordinates of the frames say about each other under the starting poses, and the verdict.
 
     `shared_decoded`: of the surface that others show, how much each frame decoded; None where not known.
+    `moving`: the share that moves before cameras in one place; None if nothing does.
     """
     from sl_nerfstudio.review.verdict import FrameFacts, ScanFacts, judge_scan
 
-    frames = tuple(
-        FrameFacts(content.name, decode_rate=content.decoded, shared_decoded=shared)
-        for content, shared in zip(result.contents, shared_decoded, strict=True)
-    )
-    verdict = judge_scan(ScanFacts(frames, cross=cross))
+    usable = [content.name for content in result.contents if content.correspondences is not None]
+    fit = result.fit
+    rays = {} if fit is None else dict(zip(usable, zip(fit.residual_px, fit.stated_px, strict=True), strict=True))
+    frames = []
+    for content, shared in zip(result.contents, shared_decoded, strict=True):
+        px, stated = rays.get(content.name, (math.nan, math.nan))
+        facts = FrameFacts(content.name, decode_rate=content.decoded, shared_decoded=shared)
+        frames.append(facts if math.isnan(stated) else replace(facts, rays_px=float(px), stated_px=float(stated)))
+    verdict = judge_scan(ScanFacts(tuple(frames), cross=cross, moving_share=moving))
     seen = [frame.seen for frame in cross.frames]
     lines = [
         f"  coverage            {100 * min(seen):.0f} to {100 * max(seen):.0f} % of a frame's points seen by others",

@@ -245,6 +245,7 @@ def judge(
         figures.insert(0, _accuracy(evaluation))
     reasons = [Reason(f.band, f"{f.name}: {f.text} (good: {f.good})") for f in figures if f.band != "unknown"]
     reasons += [Reason("acceptable", f"{f.name}: cannot be judged") for f in figures if f.band == "unknown"]
+    reasons = [*(fault.reason for fault in evaluation.mesh_faults), *reasons]
     names = [frame.name for frame in evaluation.agreement.frames]
     if evaluation.cross is not None:
         reasons += cross_reasons(names, evaluation.cross)
@@ -362,7 +363,7 @@ def _lengths(sigma: float) -> JudgedFigure:
 
 
 def _hints(evaluation: Evaluation, band: Band, intrinsics: str) -> tuple[str, ...]:
-    hints = []
+    hints = [fault.advice for fault in evaluation.mesh_faults]
     if _ORDER[band] and evaluation.starting_poses:
         hints.append(
             "These figures are for the scan's starting poses: if the surface was trained with refined ones, "

@@ -24,6 +24,7 @@ from sl_nerfstudio.review.agreement import (
     bridges,
 )
 from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.scan.check_mixed_poses import SUSPECT_SIGMAS
 
 Band = Literal["good", "acceptable", "poor"]
 BANDS: tuple[Band, ...] = ("good", "acceptable", "poor")
@@ -164,6 +165,14 @@ def _reasons(found: BoardCalibration) -> Iterator[Reason]:
                 f"corners of left-out poses are predicted to {found.left_out.error_px[k]:.2f} px in the {name}, "
                 f"fitted ones to {found.rms_px[k]:.2f} px: more poses would help",
             )
+    if found.misfit is not None:
+        yield Reason(
+            "acceptable",
+            "the model of the camera's lens does not fit: with their distance from the middle of the image, corners "
+            f"lie up to {-found.misfit.inwards_px:.2g} px inside and {found.misfit.outwards_px:.2g} px outside of "
+            "where it puts them. The focal length may be wrong by more than its sigma. Wide-angle and fisheye lenses "
+            "have no model beyond k1, k2: use a longer lens, or crop photographs and captures alike to the middle",
+        )
 
 
 def _band(value: float, limits: tuple[float, float]) -> Band:
@@ -186,6 +195,10 @@ class FrameFacts:
     shared_decoded: float | None = None  # of the surface that other frames show, where this one sees the pattern
     missing_share: float | None = None  # of the surface that other frames show in its sight: where it saw no pattern
     own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's own projector
+    rays_px: float | None = (
+        None  # how far its rays miss each other under a pose that states its uncertainty, pattern px
+    )
+    stated_px: float | None = None  # of this, what the stated uncertainty explains, 1 sigma
     degeneracies: tuple[str, ...] = ()  # why the frame itself determines the pose of its projector only weakly
 
 
@@ -208,6 +221,8 @@ class ScanFacts:
     wrong_intrinsics: bool = False  # the captures contradict the stated intrinsics
     turns_deg: tuple[float, ...] = ()  # after which the surface looks the same, so that frames may be turned by them
     by_order: bool = False  # frames fit at several sides, and the order of capture decided
+    moving_share: float | None = None  # of the decoded pixels: what moves before cameras that stand still
+    moving_registered: bool = False  # only this is in the scan
     adjusted: bool = True  # False: sl-process was told to leave the poses as registration found them
 
     @property
@@ -242,6 +257,8 @@ def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
     if len(facts.in_scan) < 2:
         yield Reason("poor", f"only {len(facts.in_scan)} of {len(facts.frames)} frames could be used")
         return
+    if facts.moving_share is not None:
+        yield _turntable(facts.moving_share, facts.moving_registered)
     yield from _left_out(facts)
     yield from _undecided(facts)
     if facts.by_order:
@@ -252,6 +269,7 @@ def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
         yield from _weak_connections(facts)
     if facts.cross is not None:
         yield from cross_reasons([f.name for f in facts.in_scan], facts.cross)
+    yield from _starting_poses(facts)
     yield from _decoding(facts)
     yield from _missing(facts)
     degenerate = [f.name for f in facts.in_scan if f.degeneracies]
@@ -264,6 +282,23 @@ def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
         )  # fmt: skip
     if facts.wrong_intrinsics:
         yield Reason("acceptable", "the captures contradict the stated intrinsics")
+
+
+def _turntable(share: float, registered: bool) -> Reason:
+    """Say that what turns was taken before something that stands still."""
+    if registered:
+        return Reason(
+            "acceptable",
+            f"turntable with a static background: only what moves, {share:.0%} of the decoded pixels, is in the scan. "
+            "See in the report that it is all of the object; to be certain, cover the background, or leave it out with "
+            "sl-process --masks",
+        )
+    return Reason(
+        "poor",
+        f"all cameras are in one place while {share:.0%} of the decoded pixels show something that moves: turntable "
+        "with a static background. The scan holds the background, and the object in several positions: leave the "
+        "background out with sl-process --masks, or cover it and capture again",
+    )
 
 
 def _left_out(facts: ScanFacts) -> Iterator[Reason]:
@@ -389,6 +424,34 @@ def cross_reasons(names: Sequence[str], cross: CrossFrameAgreement) -> Iterator[
             "poor" if cross.share < _LEAST_SHARE else "acceptable",
             f"of all points that two frames saw, {cross.share:.0%} agree: 95 % lie within {cross.px_p95:.2g} px, the "
             f"noise is {cross.noise_px:.2g} px",
+        )
+
+
+def _starting_poses(facts: ScanFacts) -> Iterator[Reason]:
+    """Relative poses that the coordinates of their own frames exclude, by what is stated of them."""
+    known = [(f.rays_px / f.stated_px, f) for f in facts.in_scan if f.rays_px is not None and f.stated_px]
+    if not known:
+        return
+    if _median([excess for excess, _ in known]) > SUSPECT_SIGMAS:
+        rays, stated = (_median([value or 0.0 for value in values]) for values in zip(
+            *((f.rays_px, f.stated_px) for _, f in known), strict=True
+        ))  # fmt: skip
+        yield Reason(
+            "poor",
+            f"the rays of camera and projector miss each other by {rays:.2g} px (median), the stated uncertainty of "
+            f"the poses explains {stated:.2g} px: poses or intrinsics are of another calibration, or sl_pose_sigma is "
+            "too small. Without sl_pose_sigma the training searches farther from these poses; sl-process finds "
+            "poses from the photographs",
+        )
+        return
+    bad = [(excess, f) for excess, f in known if excess > _MOST_SIGMA]
+    if bad:
+        frame = max(bad, key=lambda one: one[0])[1]
+        yield Reason(
+            _share_band(len(bad), len(facts.in_scan)),
+            f"{listed([f.name for _, f in bad])}: the rays of camera and projector miss each other by far more than "
+            f"the stated uncertainty of the poses explains ({frame.name}: {frame.rays_px:.2g} px, stated "
+            f"{frame.stated_px:.2g} px); give these frames another pose of the projector, or leave them out",
         )
 
 
