@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 from zipfile import BadZipFile
 
+from sl_nerfstudio.bundle_adjustment.modes import Mode
 from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.geometry.devices import Device
@@ -33,7 +34,7 @@ VERSIONS = {
     "test of intrinsics": 1,  # relative_pose/intrinsics.py
     "static projector": 1,  # registration/static_projector.py
     "registration": 1,  # registration/
-    "adjustment": 1,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
+    "adjustment": 2,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
 }
 """Number of each stage. Raise it whenever the stage, or anything that it calls, may give another result from the same
 inputs: another algorithm, constant, order of summation or field of a result. Names, comments and speed need none.
@@ -43,7 +44,7 @@ KEPT: tuple[type, ...] = (
     result.Registration, result.Edge, result.SurfaceDisagrees, result.NoCommonSurface, result.SeparateComponent,
     result.PoorPair, result.PairsContradict, result.CoordinatesDisagree, result.UndecidedProjector,
     result.UncertainRotation, result.SeparatePoses,
-    ConsistentFrames, AdjustedFrames, DevicePoses, PoseSigma, SelfCalibration,
+    ConsistentFrames, AdjustedFrames, Mode, DevicePoses, PoseSigma, SelfCalibration,
     Device, ProjectorEstimate, NoProjector, StaticPlacement, NoPlacement, IntrinsicsEvidence,
     DeviceEvidence,
     CrossFrameAgreement, FrameCrossAgreement, PairAgreement, RelativePose, Degeneracy,
