@@ -85,7 +85,7 @@ class LeftOut:
 
 def choose_models(start: AdjustedBoard, seen: Seen, track: Track) -> tuple[Free, tuple[ModelScore, ...]]:
     """The model of each device, and what was compared: first the terms of the lens, then two focal lengths."""
-    free: Free = (FreeIntrinsics(), *(_RICH for _ in start.rig.devices[1:]))
+    free: Free = (start.free[0], *(replace(_RICH, aspect=one.aspect) for one in start.free[1:]))
     sigma = adjust(start.rig, tuple(_RICHEST for _ in free), seen).sigma_px
     scores: list[ModelScore] = []
     for device, name in enumerate(("camera", "projector")[: len(free)]):
@@ -95,8 +95,10 @@ def choose_models(start: AdjustedBoard, seen: Seen, track: Track) -> tuple[Free,
             found = leave_out(start.rig, tried, seen, sigma)
             return ModelScore(device, model, found.error_px, found.costs, found.whole.rig.devices[device])
 
-        found = [score(FreeIntrinsics(False, terms)) for terms in track(_TERMS, f"Lens models of the {name}")]
-        found.append(score(FreeIntrinsics(True, found[_simplest(found)].model.terms)))
+        aspect = start.free[device].aspect
+        found = [score(FreeIntrinsics(aspect, terms)) for terms in track(_TERMS, f"Lens models of the {name}")]
+        if not aspect:
+            found.append(score(FreeIntrinsics(True, found[_simplest(found)].model.terms)))
         best = _simplest(found)
         scores += [replace(one, chosen=k == best) for k, one in enumerate(found)]
         free = (*free[:device], found[best].model, *free[device + 1 :])

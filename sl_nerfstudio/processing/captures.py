@@ -15,12 +15,13 @@ from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.gray_code import check_count, decode_gray_code, take_samples
-from sl_nerfstudio.decoding.gray_code_order import check_order, layout_of_images, possible_layouts
+from sl_nerfstudio.decoding.gray_code_order import check_order, layout_of_images, possible_layouts, with_numbering
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.gray_code import GrayCode
-from sl_nerfstudio.pattern.layout import PatternLayout, SequenceName
+from sl_nerfstudio.pattern.layout import CENTRED, PatternLayout, SequenceName
 from sl_nerfstudio.processing.config import FEWEST_FRAMES
+from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError, unreadable
 from sl_nerfstudio.scan.images import ENDINGS, RAW, photograph_header, raw_file, read_photograph, turned_by_tag
 
@@ -42,10 +43,13 @@ class SeveralFaults(FileError):
 
     def __init__(self, folder: Path, errors: Sequence[FileError]) -> None:
         """`folder` holds the frame's images."""
-        listed = [f"{e.path.name if e.path != folder else 'the folder'} {e.problem}" for e in errors]
-        more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+        same: dict[str, list[str]] = {}
+        for e in errors:
+            same.setdefault(e.problem, []).append(e.path.name if e.path != folder else "the folder")
+        found = [f"{listed(n, _LISTED)}{': each' if len(n) > 1 else ''} {problem}" for problem, n in same.items()]
+        more = f"; and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
         causes, remedies = (dict.fromkeys(getattr(e, key) for e in errors) for key in ("cause", "remedy"))
-        problem = f"has {len(errors)} faults: {'; '.join(listed[:_LISTED])}{more}"
+        problem = f"has {len(errors)} faults: {'; '.join(found[:_LISTED])}{more}"
         super().__init__(folder, problem, "; ".join(causes), "; ".join(remedies))
         self.errors = tuple(errors)
 
@@ -77,12 +81,18 @@ class Captures:
         return replace(self, faults={name: _together(named[name], errors) for name, errors in both.items()})
 
 
-def find_captures(root: Path, sequences: bool, cameras: Sequence[str] = ()) -> Captures:
+def find_captures(
+    root: Path,
+    sequences: bool,
+    cameras: Sequence[str] = (),
+    needs: str = f"a scan needs at least {FEWEST_FRAMES} frames",
+) -> Captures:
     """Frames in a folder: one image each or, with `sequences`, one sub-folder of images each.
 
     With the names of several `cameras`, the frames of each are in a sub-folder of that name. Of each camera the most
     frequent image size is taken to be right. Images of another size, and images that cannot be read, are faults of
-    their frames. Raises FileError if there are fewer than two frames, or no folder for a camera.
+    their frames. Raises FileError, which says what `needs` how many, if there are fewer than two frames, or no folder
+    for a camera.
     """
     if not os.path.isdir(root):  # Path.is_dir raises for a name that is too long
         raise FileError(root, "is no folder", "a typing error in --images", "give the folder with the captures")
@@ -90,7 +100,7 @@ def find_captures(root: Path, sequences: bool, cameras: Sequence[str] = ()) -> C
         found = _of_cameras(root, sequences, cameras) if cameras else [_frames(root, sequences)]
         frames = [frame for turn in zip_longest(*found) for frame in turn if frame is not None]
         if len(frames) < FEWEST_FRAMES:
-            raise _too_few(root, sequences, len(frames))
+            raise _too_few(root, sequences, len(frames), needs)
     except OSError as error:
         raise unreadable(root, error) from error
     duplicates = [name for name, count in Counter(f.name for f in frames).items() if count > 1]
@@ -101,20 +111,30 @@ def find_captures(root: Path, sequences: bool, cameras: Sequence[str] = ()) -> C
     return _checked(frames)
 
 
-def _too_few(root: Path, sequences: bool, count: int) -> FileError:
+def _too_few(root: Path, sequences: bool, count: int, needed: str) -> FileError:
+    inside = [
+        path for path in sorted(root.iterdir()) if path.is_dir() and len(_frames(path, sequences)) > max(count, 1)
+    ]
+    if len(inside) == 1 and not _images(root):
+        return FileError(
+            root,
+            f"holds its captures in a folder of its own, {inside[0].name}",
+            "--images is the folder with the captures, not the one around it",
+            f"give --images {inside[0]}",
+        )
     raw = _images(root, RAW)
     if raw:
         return raw_file(raw[0])
     what = "folders with images" if sequences else "images"
     other = _single_images(root) if sequences else _folders(root)
     cause, remedy = "a typing error in --images, or images of another format", ""
+    if count:
+        cause = f"too few were captured, or {cause}"
     if len(other) > 1:
         cause = "the captures do not suit the pattern: a coded grid needs one image per frame, Gray code one sub-folder"
         remedy = "" if sequences else '; for several cameras, name them under "cameras" in the intrinsics file'
     wanted = "sub-folders, one for each frame" if sequences else f"{', '.join(ENDINGS)} files"
-    return FileError(
-        root, f"holds {count} {what}; a scan needs at least 2 frames", cause, f"give a folder of {wanted}{remedy}"
-    )
+    return FileError(root, f"holds {count} {what}; {needed}", cause, f"give a folder of {wanted}{remedy}")
 
 
 def _of_cameras(root: Path, sequences: bool, cameras: Sequence[str]) -> list[list[CapturedFrame]]:
@@ -152,7 +172,7 @@ def _checked(frames: Sequence[CapturedFrame]) -> Captures:
         own = [path for frame in frames if frame.camera == camera for path in frame.images]
         known = [sizes[path] for path in own if path in sizes]
         if not known:
-            raise next(faults[frame.name][0] for frame in frames if frame.camera == camera)
+            raise _of_a_kind([e for frame in frames if frame.camera == camera for e in faults[frame.name]])[0]
         usual[camera] = Counter(known).most_common(1)[0][0]
     for frame in frames:
         for path in frame.images:
@@ -160,6 +180,24 @@ def _checked(frames: Sequence[CapturedFrame]) -> Captures:
                 faults.setdefault(frame.name, []).append(_other_size(path, sizes[path], usual[frame.camera]))
     named = {frame.name: frame for frame in frames}
     return Captures(tuple(frames), usual, {name: _together(named[name], found) for name, found in faults.items()})
+
+
+def describe_faults(captures: Captures) -> list[str]:
+    """What is wrong with the frames that cannot be used, in one message for each kind of fault."""
+    return list(map(str, _of_a_kind(list(captures.faults.values()))))
+
+
+def _of_a_kind(errors: Sequence[FileError]) -> list[FileError]:
+    """One error for all files with the same problem, which names them."""
+    same: dict[str, list[FileError]] = {}
+    for error in errors:
+        same.setdefault(error.problem, []).append(error)
+    out = []
+    for first, *others in same.values():
+        names = [error.path.name for error in others]
+        more = f" (and so {'are' if len(names) > 1 else 'is'} {listed(names, _LISTED)})" if names else ""
+        out.append(first if not more else FileError(first.path, first.problem + more, first.cause, first.remedy))
+    return out
 
 
 def _together(frame: CapturedFrame, errors: Sequence[FileError]) -> FileError:
@@ -220,6 +258,11 @@ def likely_layout(captures: Captures, name: SequenceName) -> GrayCode:
     """
     whole = captures.require_whole()
     count = len(whole[0].images)
+    if name in CENTRED:
+        raise UserError(
+            f"--sequence {name}: does not tell the projector's resolution\n    cause:  its codes depend on it\n"
+            "    remedy: give the resolution, as --pattern 1024x768"
+        )
     fitting = [layout for w, h in STANDARD if (layout := GrayCode.in_order(name, w, h)).images == count]
     if not fitting:
         raise FileError(
@@ -357,7 +400,7 @@ def describe_sequence(layout: GrayCode) -> str:
     """One line for the output."""
     return (
         f"Gray code of {layout.w} x {layout.h} pixels in cells of {layout.cell}: {layout.images} images, order "
-        f"{layout.order}"
+        f"{layout.order}{', cells numbered from the middle of the code' if layout.centred else ''}"
     )
 
 
@@ -409,14 +452,18 @@ def recognise_sequence(
     whole = captures.require_whole()
     found: dict[GrayCode, Path] = {}
     errors: list[UserError] = []
+    centred = False
     for frame in whole[:_LOOKED_AT]:
         folder = frame.images[0].parent
         try:
             possible = possible_layouts(len(frame.images), size, name, cell)
+            images = [read_photograph(path) for path in frame.images]
             if len(possible) == 1 and possible[0].bit_images(0) and name is not None:
-                found.setdefault(possible[0], folder)  # nothing to recognise: a frame that does not fit says so itself
-                continue
-            found.setdefault(layout_of_images([read_photograph(p) for p in frame.images], size, name, cell), folder)
+                layout = with_numbering(possible[0], images)  # a frame that does not fit says so itself
+            else:
+                layout = layout_of_images(images, size, name, cell)
+            centred = centred or layout.centred  # a frame that shows the middle alone does not tell
+            found.setdefault(replace(layout, centred=False), folder)
         except FileError as error:
             errors.append(error)
         except DecodingError as error:
@@ -430,6 +477,6 @@ def recognise_sequence(
             f"{second.cell})\n    cause:  the folders hold captures of several sequences\n"
             "    remedy: process them separately, or name the sequence with --sequence"
         )
-    layout = next(iter(found))
+    layout = replace(next(iter(found)), centred=centred)
     _require_resolution(captures, layout)
     return layout

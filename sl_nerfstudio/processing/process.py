@@ -13,19 +13,28 @@ import numpy as np
 from jaxtyping import Float64, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.console import track
+from sl_nerfstudio.console import phase, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import ShownImage
 from sl_nerfstudio.processing.cache import StageStore, work_folder
+from sl_nerfstudio.processing.captures import describe_faults
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
 from sl_nerfstudio.processing.consistency import (
     ConsistentFrames,
     adjust_consistent,
     compare_registered,
     registered_only,
+)
+from sl_nerfstudio.processing.earlier_runs import (
+    WrittenScan,
+    digest_of_captures,
+    note_scan,
+    note_work,
+    with_kept_work,
+    written_scan,
 )
 from sl_nerfstudio.processing.frames import (
     FrameJob,
@@ -203,23 +212,60 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
     in the work folder.
     """
     config.check()
-    with NewFolder(config.output) as folder, work_folder(config.work_folder):
-        return _process(config, folder, make_report, log)
+    own, config = config.work_folder, with_kept_work(config)
+    if config.work_folder != own:
+        log(f"these captures were processed before: {config.work_folder} has what was kept of that")
+    earlier = written_scan(config)
+    renewed = () if earlier is None else tuple(earlier.files)
+    with NewFolder(config.output, renewed) as folder, work_folder(config.work_folder):
+        return _process(config, folder, earlier, make_report, log)
 
 
-def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, log: Log) -> ProcessResult:
-    inputs = read_inputs(config)
-    captures, decoder = inputs.captures, inputs.job.decoder.name
-    log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
-    for sentence in inputs.notes.sentences:
-        log(sentence)
-    frames = _calibrate(config, inputs, make_report, log)
-    wrong = _wrong_intrinsics(inputs, frames, log)
-    given = _given(inputs, frames.results)
-    frames, registration = _register(config, inputs, frames, given, log)
-    _require_registered(config, inputs, frames.results, registration, wrong, make_report)
-    frames, consistent = _adjust(config, inputs, frames, registration, log)
-    frames, consistent, moving = _register_what_moves(config, inputs, frames, consistent, log)
+def _process(
+    config: ProcessConfig, folder: NewFolder, earlier: WrittenScan | None, make_report: MakeReport, log: Log
+) -> ProcessResult:
+    with phase("read"):
+        inputs = read_inputs(config)
+        note_work(config)
+        captures, decoder = inputs.captures, inputs.job.decoder.name
+        log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
+        for sentence in (*inputs.notes.sentences, *(f"left out: {fault}" for fault in describe_faults(captures))):
+            log(sentence)
+        digest = digest_of_captures(captures)
+        if earlier is not None:
+            earlier.require_same(digest, config.output)
+            log(f"{config.output} holds an earlier scan of the same captures, which this one replaces")
+    with phase("decode"):
+        frames = _calibrate(config, inputs, make_report, log)
+        wrong = _wrong_intrinsics(inputs, frames, log)
+    with phase("register"):
+        given = _given(inputs, frames.results)
+        frames, registration = _register(config, inputs, frames, given, log)
+        _require_registered(config, inputs, frames.results, registration, wrong, make_report)
+    with phase("adjust"):
+        frames, consistent = _adjust(config, inputs, frames, registration, log)
+        frames, consistent, moving = _register_what_moves(config, inputs, frames, consistent, log)
+        both = consistent.adjusted.median_before_px, consistent.adjusted.median_after_px
+        if np.isfinite(both).all():
+            log("frames agree to {1:.2f} px, {0:.2f} px before".format(*both))
+    with phase("write"):
+        result = _write(config, inputs, frames, consistent, moving, wrong, folder, make_report, log)
+        note_scan(config, folder, digest)
+    return result
+
+
+def _write(
+    config: ProcessConfig,
+    inputs: Inputs,
+    frames: CalibratedFrames,
+    consistent: ConsistentFrames,
+    moving: MovingPart | None,
+    wrong: str,
+    folder: NewFolder,
+    make_report: MakeReport,
+    log: Log,
+) -> ProcessResult:
+    """Judge the adjusted frames, and write the scan with its report."""
     given = _given(inputs, frames.results)
     registration, adjusted = consistent.registration, within_stated_doubt(consistent.adjusted, frames.job.stated)
     poses = find_scan_poses(clouds_of(frames.results), registration, adjusted, inputs.known, given)
@@ -234,7 +280,7 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
     shares = () if cross is None else _surface_shares(frames.job, results, shown, adjusted.poses, parts)
     result = summarise(
         config,
-        decoder,
+        inputs.job.decoder.name,
         frames.results,
         registration,
         poses,
@@ -246,8 +292,6 @@ def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, 
         parts,
         moving,
     )
-    if result.joint_px is not None:
-        log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
     write_scan(folder, frames.job, frames.results, poses, result, make_report)
     return result
 
@@ -354,12 +398,12 @@ def register_clouds(
 ) -> tuple[tuple[int, ...], Registration]:
     """Which cloud of every frame, and the registration of these; every pair is tried if the order says nothing."""
     choice = choose_projectors(clouds, not unordered, seed)
-    registration = register(chosen_clouds(clouds, choice.chosen), not unordered, seed, start, log)
+    registration = register(chosen_clouds(clouds, choice.chosen), not unordered, seed, start)
     if not (unordered or registration.ordered):
         log("the frames do not follow each other in the order of capture: --unordered says so")
         before, choice = choice, choose_projectors(clouds, False, seed)  # they were compared with wrong neighbours
         if choice.chosen != before.chosen:
-            registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start, log)
+            registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start)
     return choice.chosen, without_undecided(registration, choice.undecided)
 
 

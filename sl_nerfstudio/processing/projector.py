@@ -30,6 +30,7 @@ from sl_nerfstudio.processing.frames import (
     FrameJob,
     FrameStageResult,
     FrameWorker,
+    capture_sentences,
     clouds_of,
     describe_frame_stage,
     run_frame_stage,
@@ -626,6 +627,8 @@ def calibrate_frames(config: ProcessConfig, inputs: Inputs, log: Log) -> Calibra
     """Decode and calibrate all frames. Raises UserError where a projector is to be found and cannot be."""
     job, found = inputs.job, None
     results = run_frame_stage(config, job, inputs.captures)
+    for sentence in capture_sentences([(result.name, result.notes) for result in results]):
+        log(sentence)
     if config.finds_projector:
         log(f"decoded {sum(bool(result.key) for result in results)} of {len(results)} frames")
         if config.rig == "static-projector":

@@ -15,7 +15,7 @@ from sl_nerfstudio.calibration.stated import describe_change
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.frames import FrameStageResult, clouds_of
+from sl_nerfstudio.processing.frames import FrameStageResult, capture_sentences, clouds_of
 from sl_nerfstudio.processing.inputs import CaptureNotes
 from sl_nerfstudio.processing.object_only import ObjectOnly, object_document
 from sl_nerfstudio.processing.projector import FoundProjector
@@ -36,7 +36,7 @@ from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind
 from sl_nerfstudio.review.agreement import CrossFrameAgreement, SurfaceShares
 from sl_nerfstudio.review.moving_part import MovingPart, in_one_place
-from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, ScanFacts, Verdict, judge_scan, listed
+from sl_nerfstudio.review.verdict import FrameFacts, Help, PairFacts, ScanFacts, Verdict, judge_scan, listed
 
 # Sentences for what relative pose estimation and registration found out about frames.
 
@@ -230,7 +230,19 @@ def without_empty(frames: Sequence[FrameRecord], found: ObjectOnly) -> tuple[Fra
     )
 
 
-# What to capture again, and why.
+# What helps against each reason of the verdict, and what to capture again, and why.
+
+HELP: dict[Help, str] = {
+    "again": "capture these views again, and run the same sl-process with them",
+    "between": "capture views in between, and run the same sl-process with them",
+    "light": "focus better, with more light from the projector and less from the room, capture it again, and run the "
+    "same sl-process",
+    "nearer": "hold the projector farther from the camera, show parts at other depths, and run the same sl-process",
+    "poses": "calibrate both devices again with sl-calibrate, and run sl-process with the new intrinsics",
+    "adjust": "run the same sl-process without --no-adjust",
+    "intrinsics": "calibrate again with sl-calibrate, or train with ns-train sl-neus --data SCAN "
+    "--pipeline.model.refine-intrinsics True",
+}
 
 _LOW_RATE = 0.6  # decoded share of the pattern
 _SMALL_SHARE = 0.03  # of the image that shows the pattern
@@ -372,6 +384,7 @@ def summarise(
             *([wrong] if wrong else []),
             *([found.doubt] if found and found.doubt else []),
             *(map(uncertainty_sentence, registration.uncertainties) if registration else ()),
+            *capture_sentences([(result.name, result.notes) for result in results]),
         ),
         recapture=what_to_recapture(frames, pairs, not config.unordered),
         joint_px=None if adjusted is None else _both_known(adjusted.median_before_px, adjusted.median_after_px),
@@ -392,7 +405,7 @@ def summarise(
                 moving is not None and moving.registered,
                 adjusted=not config.no_adjust,
             )
-        ),
+        ).with_help(HELP),
         projector=found,
         contradiction=wrong,
         object_only=parts,

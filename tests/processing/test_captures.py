@@ -12,7 +12,7 @@ from PIL import Image
 from sl_nerfstudio.calibration.formats import camera_names, read_device_file
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.gray_code import GrayCode
-from sl_nerfstudio.processing.captures import find_captures, incomplete
+from sl_nerfstudio.processing.captures import describe_faults, find_captures, incomplete
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.inputs import read_captured
 from sl_nerfstudio.scan.images import encode_png
@@ -58,10 +58,42 @@ def test_images_of_another_size_and_unreadable_ones_are_faults_of_their_frames(t
     assert all("remedy:" in text for text in (turned, empty, large))
 
 
+def test_all_files_with_the_same_fault_are_named_together(tmp_path):
+    for k in range(4):
+        _write(tmp_path / f"f{k}.png")
+    _write(tmp_path / "hidden.png", 8, 6)
+    for name in ("cut1.png", "cut2.png"):
+        Image.new("RGBA", (16, 12), (9, 9, 9, 100)).save(tmp_path / name)
+    sentences = describe_faults(find_captures(tmp_path, sequences=False))
+    assert len(sentences) == 2
+    assert "cut1.png: is transparent in places (and so is cut2.png)" in sentences[0]
+    assert "hidden.png: is 8 x 6 pixels, most images are 16 x 12" in sentences[1]
+    for k in range(4):
+        (tmp_path / f"f{k}.png").unlink()
+    (tmp_path / "hidden.png").unlink()
+    with pytest.raises(UserError, match=r"cut1.png: is transparent in places \(and so is cut2.png\)"):
+        find_captures(tmp_path, sequences=False)
+    for k in range(8):
+        _write(tmp_path / "sequence" / f"{k}.png", mode="RGBA" if k else "L")  # transparent
+        _write(tmp_path / "whole" / f"{k}.png")
+    fault = find_captures(tmp_path, sequences=True).faults["sequence"]
+    assert "has 7 faults: 1.png, 2.png, 3.png, 4.png, 5.png and 2 more: each is transparent in places" in str(fault)
+
+
 @pytest.mark.parametrize(
     ("sequences", "files", "message"),
     [
         (False, ["a.png"], "holds 1 images; a scan needs at least 2 frames"),
+        (
+            False,
+            ["images/1.png", "images/2.png"],
+            r"holds its captures in a folder of its own, images(.*\n)*.*/images$",
+        ),
+        (
+            True,
+            ["images/p/1.png", "images/q/1.png"],
+            r"in a folder of its own, images(.*\n)*.*give --images .*/images$",
+        ),
         (False, ["x/1.png", "y/1.png"], "holds 0 images.*\n.*do not suit the pattern: a coded grid needs"),
         (True, ["1.png", "2.png"], "holds 0 folders with images.*\n.*do not suit the pattern"),
         (False, ["a.png", "a.jpg", "b.png"], "several images named a"),

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sl_nerfstudio.processing.result import HELP
 from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, Reason, ScanFacts, judge_scan, listed, worst
 from tests.review.cases import ring
 
@@ -157,3 +158,11 @@ def test_a_turntable_before_a_static_background_is_never_good(registered: bool, 
     verdict = judge_scan(ScanFacts(frames, moving_share=0.08, moving_registered=registered))
     assert verdict.band == band and "turntable with a static background" in verdict.reasons[0]
     assert "8%" in verdict.reasons[0] and "sl-process --masks" in verdict.reasons[0]
+
+
+def test_each_reason_ends_with_what_helps_in_the_words_of_a_command():
+    lost = {3: {"in_scan": False}, 4: {"sigma_rotation_deg": 5.0}}
+    verdict = judge_scan(scan(lost, wrong_intrinsics=True, adjusted=False)).with_help(HELP)
+    assert len(verdict.reasons) == 4 and all(any(end in reason for end in HELP.values()) for reason in verdict.reasons)
+    assert all("sl-process" in words or "sl-calibrate" in words for words in HELP.values())
+    assert worst([Reason("poor", "a", "again"), Reason("poor", "b")]).with_help({"again": "c"}).reasons == ("a; c", "b")
