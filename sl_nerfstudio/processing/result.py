@@ -36,7 +36,16 @@ from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind
 from sl_nerfstudio.review.agreement import CrossFrameAgreement, SurfaceShares
 from sl_nerfstudio.review.moving_part import MovingPart, in_one_place
-from sl_nerfstudio.review.verdict import FrameFacts, Help, PairFacts, ScanFacts, Verdict, judge_scan, listed
+from sl_nerfstudio.review.verdict import (
+    FrameFacts,
+    Help,
+    PairFacts,
+    ScanFacts,
+    Verdict,
+    judge_scan,
+    listed,
+    other_places,
+)
 
 # Sentences for what relative pose estimation and registration found out about frames.
 
@@ -403,6 +412,9 @@ def summarise(
                 registration is not None and registration.by_order,
                 None if moving is None else moving.share,
                 moving is not None and moving.registered,
+                ()
+                if adjusted is None
+                else other_places(adjusted.modes, [r.name for r in results if r.cloud is not None]),
                 adjusted=not config.no_adjust,
             )
         ).with_help(HELP),

@@ -11,6 +11,7 @@ from typing import Literal
 
 import numpy as np
 
+from sl_nerfstudio.bundle_adjustment.modes import Mode
 from sl_nerfstudio.bundle_adjustment.parameters import USUAL_FRAME_ROTATION_DEG
 from sl_nerfstudio.calibration.board import BoardCalibration
 from sl_nerfstudio.geometry.lie import DevicePoses, angle_deg
@@ -232,6 +233,28 @@ class PairFacts:
 
 
 @dataclass(frozen=True)
+class OtherPlace:
+    """Frames that may stand elsewhere as one: what was seen leaves it possible."""
+
+    frames: tuple[str, ...]
+    angle_deg: float  # by which they would be turned against the others
+    odds: float  # of that place against the one in the scan
+
+    def sentence(self) -> str:
+        """Name the frames, how far the other place is, and how likely."""
+        likely = f"1 in {1 / self.odds + 1:.0f}" if self.odds < 1 else "as likely"
+        return f"{listed(self.frames)}: may be turned by {self.angle_deg:.0f} degrees against the others ({likely})"
+
+
+def other_places(modes: Sequence[Mode], names: Sequence[str]) -> tuple[OtherPlace, ...]:
+    """Other poses that an adjustment leaves possible; `names` of all its frames."""
+    return tuple(
+        OtherPlace(tuple(names[k] for k in mode.frames), mode.angle_deg, math.exp(min(mode.log_odds, 0.0)))
+        for mode in modes
+    )
+
+
+@dataclass(frozen=True)
 class ScanFacts:
     """All captures of a scan, in order."""
 
@@ -243,6 +266,7 @@ class ScanFacts:
     by_order: bool = False  # frames fit at several sides, and the order of capture decided
     moving_share: float | None = None  # of the decoded pixels: what moves before cameras that stand still
     moving_registered: bool = False  # only this is in the scan
+    other_places: tuple[OtherPlace, ...] = ()  # of frames in the scan
     adjusted: bool = True  # False: sl-process was told to leave the poses as registration found them
 
     @property
@@ -263,6 +287,7 @@ _LEAST_OWN_SHARE = 0.5  # of a frame's decoded pixels, those that must agree wit
 _GOOD_SIGMA_DEG = 1.0  # standard deviation of a frame's rotation up to which a scan is good, and beyond which it is
 # acceptable: edges of the object may be smeared by a hundredth of its size
 _LARGEST_SIGMA_DEG = 3.0  # beyond which the frame may well be wrong and the scan is poor
+_ACCEPTABLE_ODDS, _POOR_ODDS = 1e-3, 5e-2  # of another place of frames, from which a scan is not good, and is poor
 _LEAST_SEEN = 0.15  # share of a frame's points that other frames must be able to judge, as registration demands
 _LEAST_SHARE = 0.85  # of the judged points, those that must agree in an acceptable scan, in every frame and over all
 
@@ -281,6 +306,9 @@ def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
         yield _turntable(facts.moving_share, facts.moving_registered)
     yield from _left_out(facts)
     yield from _undecided(facts)
+    for place in facts.other_places:
+        if place.odds > _ACCEPTABLE_ODDS:
+            yield Reason("poor" if place.odds > _POOR_ODDS else "acceptable", place.sentence(), "between")
     if facts.by_order:
         yield _placed_by_order(facts.turns_deg)
     elif facts.turns_deg:

@@ -5,8 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sl_nerfstudio.bundle_adjustment.modes import Mode
 from sl_nerfstudio.processing.result import HELP
-from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, Reason, ScanFacts, judge_scan, listed, worst
+from sl_nerfstudio.review.verdict import (
+    FrameFacts,
+    PairFacts,
+    Reason,
+    ScanFacts,
+    judge_scan,
+    listed,
+    other_places,
+    worst,
+)
 from tests.review.cases import ring
 
 N = 12
@@ -166,3 +176,14 @@ def test_each_reason_ends_with_what_helps_in_the_words_of_a_command():
     assert len(verdict.reasons) == 4 and all(any(end in reason for end in HELP.values()) for reason in verdict.reasons)
     assert all("sl-process" in words or "sl-calibrate" in words for words in HELP.values())
     assert worst([Reason("poor", "a", "again"), Reason("poor", "b")]).with_help({"again": "c"}).reasons == ("a; c", "b")
+
+
+@pytest.mark.parametrize(("log_odds", "band"), [(-8.0, "good"), (-5.7, "acceptable"), (-1.0, "poor"), (0.5, "poor")])
+def test_another_place_that_remains_possible_is_said_with_its_odds(log_odds: float, band: str) -> None:
+    mode = Mode(log_odds, 1.0, (1, 3), 90.0, (0.0, 0.0, 1.0))
+    frames = tuple(FrameFacts(f"f{k}") for k in range(8))
+    verdict = judge_scan(ScanFacts(frames, other_places=other_places([mode], [f.name for f in frames])))
+    assert verdict.band == band
+    if band != "good":
+        likely = "as likely" if log_odds > 0 else f"1 in {np.exp(-log_odds) + 1:.0f}"
+        assert verdict.reasons[0] == f"f1, f3: may be turned by 90 degrees against the others ({likely})"
