@@ -50,7 +50,7 @@ def refine_intrinsics(
     contradiction falls; held-out pixels then decide once between the first result and the last.
     """
     maps, held_out = maps_and_held_out(loaded.scan, loaded.samples)
-    once = replace(settings, other_minima=0)  # poses are adjusted again later
+    once = replace(settings, other_minima=False)  # poses are adjusted again later
 
     def adjusted_with(change: IntrinsicsChange) -> ScanAdjustment:
         scan = loaded.scan.with_intrinsics_change(change)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sl_nerfstudio.processing.result import HELP
 from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, Reason, ScanFacts, judge_scan, listed, worst
 from tests.review.cases import ring
 
@@ -137,3 +138,31 @@ def test_the_worst_reason_comes_first():
     verdict = worst([Reason("good", "a"), Reason("acceptable", "b"), Reason("poor", "c"), Reason("acceptable", "d")])
     assert (verdict.band, verdict.reasons) == ("poor", ("c", "b", "d"))
     assert listed(list("abcdefgh")) == "a, b, c, d, e, f and 2 more"
+
+
+def test_rays_that_miss_by_more_than_is_stated_make_the_starting_poses_poor() -> None:
+    frames = tuple(FrameFacts(f"f{k}", rays_px=38.0 + k, stated_px=10.0) for k in range(8))
+    verdict = judge_scan(ScanFacts(frames))
+    assert verdict.band == "poor"
+    for part in ("42 px (median)", "explains 10 px", "sl_pose_sigma", "sl-process"):
+        assert part in verdict.reasons[0]
+    assert judge_scan(ScanFacts(tuple(replace(f, stated_px=20.0) for f in frames))).band == "good"
+    one = replace(frames[0], rays_px=80.0), *(replace(f, rays_px=7.0) for f in frames[1:])
+    verdict = judge_scan(ScanFacts(one))
+    assert verdict.band == "acceptable" and verdict.reasons[0].startswith("f0: the rays of camera and projector miss")
+
+
+@pytest.mark.parametrize(("registered", "band"), [(True, "acceptable"), (False, "poor")])
+def test_a_turntable_before_a_static_background_is_never_good(registered: bool, band: str) -> None:
+    frames = tuple(FrameFacts(f"f{k}") for k in range(8))
+    verdict = judge_scan(ScanFacts(frames, moving_share=0.08, moving_registered=registered))
+    assert verdict.band == band and "turntable with a static background" in verdict.reasons[0]
+    assert "8%" in verdict.reasons[0] and "sl-process --masks" in verdict.reasons[0]
+
+
+def test_each_reason_ends_with_what_helps_in_the_words_of_a_command():
+    lost = {3: {"in_scan": False}, 4: {"sigma_rotation_deg": 5.0}}
+    verdict = judge_scan(scan(lost, wrong_intrinsics=True, adjusted=False)).with_help(HELP)
+    assert len(verdict.reasons) == 4 and all(any(end in reason for end in HELP.values()) for reason in verdict.reasons)
+    assert all("sl-process" in words or "sl-calibrate" in words for words in HELP.values())
+    assert worst([Reason("poor", "a", "again"), Reason("poor", "b")]).with_help({"again": "c"}).reasons == ("a; c", "b")
