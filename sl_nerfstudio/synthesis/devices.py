@@ -88,7 +88,7 @@ def make_paths(scene: Scene, frames: int, kind: PathKind, rng: np.random.Generat
     t = np.arange(frames) / frames
     if kind == "static-projector":
         return _about_a_projector(scene, t, rng)
-    laps = 0.5 if kind == "half-turn" else max(1, round(frames / _FRAMES_A_LAP))
+    laps = 0.5 if kind == "half-turn" else float(max(1, round(frames / _FRAMES_A_LAP)))
     camera = _around_the_object(scene, t, laps, rng)
     if kind == "rigid-rig":
         T_camera_projector = _rig(scene)

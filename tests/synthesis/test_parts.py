@@ -55,7 +55,7 @@ def test_the_feature_alone_breaks_the_symmetry_and_by_the_stated_depth(made):
     p, inside_faces = _anywhere(part), trimesh.sample.sample_surface(mesh, 20_000, seed=0)[0]
     v = np.concatenate([mesh.vertices, inside_faces])
     assert np.abs(part.body(v)).max() == pytest.approx(part.depth, rel=0.05, abs=0.05)
-    turns = np.arange(1, part.turns) * 360 / part.turns if part.turns else np.arange(30, 360, 30)
+    turns = np.arange(1, part.turns) * 360 / part.turns if part.turns else np.arange(30.0, 360, 30)
     for turn in turns:
         np.testing.assert_allclose(turned(part.body, turn)(p), part.body(p), atol=1e-9)
         assert np.abs(turned(part.solid, turn)(v)).max() > 0.5 * part.depth, turn
