@@ -319,7 +319,7 @@ def _removed(surface: "ExtractedSurface") -> list[str]:
         for count, what in (
             (trimmed.unseen, "vertices that no frame saw"),
             (trimmed.contradicted, "that frames contradict"),
-            (trimmed.loose_pieces, "loose pieces"),
+            (trimmed.loose_pieces, "loose piece" if trimmed.loose_pieces == 1 else "loose pieces"),
         )
         if count
     ]
