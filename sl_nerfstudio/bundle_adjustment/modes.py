@@ -48,9 +48,7 @@ from sl_nerfstudio.bundle_adjustment.search import (
 from sl_nerfstudio.geometry.lie import exp_se3, exp_so3, inverse, log_se3, log_so3
 from sl_nerfstudio.parallel import results
 
-_ROUGH_DEG = (
-    1.5  # uncertainty of the starting rotations, 1 sigma per axis of the median frame, from which they are rough
-)
+_ROUGH_DEG = 1.5  # 1 sigma per axis of the median frame's starting rotation, from which the starts are rough
 _PATIENCE = 4  # searches beside the best end that lead elsewhere, after which there is no further one
 _MOST_HOPS = 12  # of these
 _SIZE = 0.3  # distance from the best end at which these begin, in uncertainties of the starting poses

@@ -6,7 +6,7 @@ that the frames measured, each on its own camera ray, say where the surface is a
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import permutations, product
+from itertools import product
 
 import numpy as np
 import torch
@@ -16,7 +16,7 @@ from numpy import ndarray
 from sl_nerfstudio.console import figure, unit_word
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.geometry.devices import Intrinsics
-from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.geometry.lie import AXIS_TURNS, DevicePoses, axis_words
 from sl_nerfstudio.geometry.numerics import component_labels, evenly_spaced
 from sl_nerfstudio.geometry.triangulation import pixel_rays, triangulate
 from sl_nerfstudio.review.verdict import Reason
@@ -105,11 +105,10 @@ def other_axes(surface: IndexedMesh, points: Float64[ndarray, "n 3"]) -> str:
 
 def _axes() -> Iterator[tuple[Float64[ndarray, "3 3"], float, str]]:
     """(R, unit, words): points p of the scan are `unit * R^T p` in the mesh."""
-    for p, signs, unit in product(permutations(range(3)), product((1.0, -1.0), repeat=3), _UNITS):
-        R = np.eye(3)[list(p)] * np.array(signs)[:, None]
-        if np.linalg.det(R) < 0 or (unit == 1.0 and np.allclose(R, np.eye(3))):
+    for R, unit in product(AXIS_TURNS, _UNITS):
+        if unit == 1.0 and np.allclose(R, np.eye(3)):
             continue
-        axes = ", ".join(("-" if sign < 0 else "") + "xyz"[k] for k, sign in zip(p, signs, strict=True))
+        axes = axis_words(R)
         words = f"x, y, z of the scan are {axes} of the mesh" if axes != "x, y, z" else "its axes fit"
         words += " (y is up in the mesh)" if axes == "x, -z, y" else ""
         yield R, unit, words + (f", and its lengths are {unit:g} times the scan's" if unit != 1.0 else "")

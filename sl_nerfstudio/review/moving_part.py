@@ -50,7 +50,7 @@ class MovingPart:
 
 def moving_share(scan: Scan) -> float | None:
     """The share of a scan's decoded pixels that moves before cameras in one place; None if nothing does."""
-    coords = (np.where(f.read_mask()[..., None], f.read_coords(), np.float32(np.nan)) for f in scan.frames)
+    coords = (frame.read_masked_coords() for frame in scan.frames)
     cameras, sigma = [f.camera for f in scan.frames], [f.pose_sigma for f in scan.frames]
     found = find_moving_part(cameras, scan.projector, scan.poses, coords, sigma)
     return found and found.share

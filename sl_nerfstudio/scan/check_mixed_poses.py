@@ -7,7 +7,7 @@ mistake must bring the rays of nearly all frames together, as far as the scan st
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, product
+from itertools import product
 from typing import Literal
 
 import numpy as np
@@ -17,7 +17,15 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.least_squares import NormalEquations, minimise
-from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, angle_deg, exp_so3, fit_similarity
+from sl_nerfstudio.geometry.lie import (
+    AXIS_TURNS,
+    DevicePoses,
+    Similarity,
+    angle_deg,
+    axis_words,
+    exp_so3,
+    fit_similarity,
+)
 from sl_nerfstudio.geometry.triangulation import epipolar_residual
 from sl_nerfstudio.scan.check_geometry import Correspondences, GeometricFit, fit_geometry
 from sl_nerfstudio.scan.document import Problem
@@ -161,23 +169,16 @@ def _orders(frames: Sequence[Correspondences]) -> Iterator[_Mistake]:
 
 
 _MOST_SHIFT = 5  # frames by which a list of poses may be early or late
-_TURNS = [
-    R for p in permutations(range(3)) for signs in product((1.0, -1.0), repeat=3)
-    if np.linalg.det(R := np.eye(3)[list(p)] * np.array(signs)[:, None]) > 0
-]  # fmt: skip
-
-
 _CAUSE = "the camera poses and the projector poses are in two different worlds"
 
 
 def _turns(frames: Sequence[Correspondences]) -> Iterator[_Mistake]:
     """The camera poses with axes exchanged against the projector poses."""
-    for R in _TURNS:
-        axes = ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(np.abs(row).argmax())] for row in R)
+    for R in AXIS_TURNS:
         yield _Mistake(
             _moved(frames, Similarity(1.0, R, np.zeros(3))),
             _KEYS["camera"],
-            f"{_CAUSE}: x, y, z of the projectors' are {axes} of the cameras'",
+            f"{_CAUSE}: x, y, z of the projectors' are {axis_words(R)} of the cameras'",
             "exchange the axes of the one: a program turned the poses of one kind of device alone (nerfstudio: "
             f"applied_transform); the camera poses fit if multiplied on the left by {_rows(R)}",
         )
@@ -220,7 +221,7 @@ def _starts(frames: Sequence[Correspondences]) -> Iterator[Similarity]:
     camera, projector = (
         np.stack([getattr(f, name) for f in frames]) for name in ("T_world_camera", "T_world_projector")
     )
-    yield from (Similarity(1.0, R, np.zeros(3)) for R in _TURNS)
+    yield from (Similarity(1.0, R, np.zeros(3)) for R in AXIS_TURNS)
     yield fit_similarity(camera[:, :3, 3], projector[:, :3, 3])
     U, _, Vt = np.linalg.svd((projector[:, :3, :3] @ camera[:, :3, :3].transpose(0, 2, 1)).sum(0))
     R = (U * np.array([1.0, 1.0, np.linalg.det(U @ Vt)])) @ Vt
