@@ -75,13 +75,16 @@ class Case:
     exact: ExactScan
 
 
-def exact_scan(scene: str, seed: int) -> ExactScan:
-    """The scan of a scene, without noise in its coordinates."""
-    setup = make_setup(SynthConfig(scene=scene, frames=FRAMES, resolution=RESOLUTION, seed=seed))
+def exact_scan(
+    scene: str, seed: int, frames: int = FRAMES, resolution: int = RESOLUTION,
+    pose_error: tuple[float, float] = SynthConfig.pose_error,
+) -> ExactScan:  # fmt: skip
+    """The scan of a scene, without noise in its coordinates; `pose_error` in degrees and millimetres."""
+    setup = make_setup(SynthConfig(scene=scene, frames=frames, resolution=resolution, seed=seed, pose_error=pose_error))
     s, devices = setup.sigma, setup.devices
     assert s is not None
     sigma = (s.camera_translation, s.camera_rotation_deg, s.relative_translation, s.relative_rotation_deg)
-    coords = np.stack([setup.render(k, 1).coords for k in range(FRAMES)])
+    coords = np.stack([setup.render(k, 1).coords for k in range(frames)])
     S = centred_on(setup.scene.vertices, 2.0)
     return ExactScan(devices.camera, devices.projector, setup.truth, setup.start, sigma, S, coords, setup.cells)
 
@@ -121,7 +124,7 @@ def errors_of(case: Case, found: Adjustment) -> dict[str, Any]:
     C = P @ found.covariance @ P.T
     turn = log_se3(rig.T_world_camera @ inverse(truth.T_world_camera))[:, 3:]
     centre = (rig.T_world_camera - truth.T_world_camera)[:, :3, 3]
-    camera = torch.cat([centre, turn], 1) / _sigma(_by_camera(rig), C).reshape(n, 6)
+    camera = torch.cat([centre, turn], 1) / _sigma(by_camera(rig), C).reshape(n, 6)
     rho = log_se3(rig.T_camera_projector @ inverse(truth.T_camera_projector))
     others = torch.arange(n) != _KNOWN
     relative = (rho / C.diagonal()[6 * n :].clamp_min(1e-30).sqrt().reshape(n, 6))[others]
@@ -151,7 +154,7 @@ def _sigma(J: Float[Tensor, "k unknowns"], C: Float[Tensor, "unknowns unknowns"]
     return ((J @ C) * J).sum(1).clamp_min(1e-30).sqrt()
 
 
-def _by_camera(rig: Rig) -> Float[Tensor, "k unknowns"]:
+def by_camera(rig: Rig) -> Float[Tensor, "k unknowns"]:
     """Derivatives of each camera's position and rotation vector."""
     n = rig.frames
     J = torch.zeros(n, 6, 12 * n, dtype=torch.float64)
@@ -165,7 +168,7 @@ def _by_camera(rig: Rig) -> Float[Tensor, "k unknowns"]:
 def _between_cameras(rig: Rig) -> tuple[Float[Tensor, "pairs unknowns"], Float[Tensor, "pairs"]]:
     """Distances of each camera from the next ones, and their derivatives."""
     n, centre = rig.frames, rig.T_world_camera[:, :3, 3]
-    by_centre = _by_camera(rig).reshape(n, 6, -1)[:, :3]
+    by_centre = by_camera(rig).reshape(n, 6, -1)[:, :3]
     first = torch.arange(n)
     second = (first + n // 3) % n
     apart = centre[second] - centre[first]

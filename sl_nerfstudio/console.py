@@ -7,14 +7,11 @@ import textwrap
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
-
-if TYPE_CHECKING:
-    from rich.progress import Progress
+from typing import TypeVar
 
 WIDTH = 80
 _NAME = 12  # columns of the name before a text
@@ -100,20 +97,19 @@ def next_steps(commands: Sequence[str]) -> str:
     return "\n".join(["next:", *commands])
 
 
-# Progress of work that a person waits for: a bar on a terminal, and phases that say what they found.
+# Progress of work that a person waits for: a bar on a terminal, else lines, and phases that say what they found.
 
 T = TypeVar("T")
 
 SHOW_AFTER_SECONDS = 2.0
 PLAIN_SECONDS = 9.0  # between two lines of progress where there is no terminal: ten with what lies between phases
 _RECENT_SECONDS = 30.0  # over which the speed is measured
-_shown = False  # one bar at a time: nested bars would overwrite the same line
 _phase: "Phase | None" = None  # the one that runs: loops inside it are its progress
 
 
 @dataclass
 class Phase:
-    """A part of a long command. While it runs it shows how far it is; at its end, one line says what it found."""
+    """A part of a long command. While it runs it shows how far it is; at its end, it prints what it found."""
 
     name: str
     started: float = field(default_factory=time.monotonic)
@@ -121,12 +117,13 @@ class Phase:
     total: int | None = None
     note: str = ""
     result: str = ""
+    lines: list[str] = field(default_factory=list)  # of `say`, printed when the bar is gone
     _recent: deque[tuple[float, int]] = field(default_factory=deque)
 
     def update(self, done: int, total: int | None, note: str = "") -> None:
         """Note how much of the work is done; the time left follows from the speed of the last half minute."""
         now = time.monotonic()
-        if total != self.total or done < self.done:
+        if total != self.total or note != self.note or done < self.done:
             self._recent.clear()
         self.done, self.total, self.note = done, total, note
         self._recent.append((now, done))
@@ -146,62 +143,56 @@ class Phase:
         return (self.total - done) * (now - start) / (done - before) if done > before else None
 
     def state(self) -> str:
-        """Say how far the phase is."""
-        count = f"{self.done} of {self.total}" if self.total else ""
+        """Say how far the phase is; while nothing is counted, how long it has been running."""
+        if not self.total:
+            return ", ".join(filter(None, [self.note, f"{duration(time.monotonic() - self.started)} so far"]))
         left = self.seconds_left
+        count = f"{self.done} of {self.total}"
         return ", ".join(filter(None, [count, self.note, "" if left is None else f"{duration(left)} left"]))
 
 
 @contextmanager
 def phase(name: str) -> Iterator[Phase]:
-    """Show a part of a command while it runs: a bar on a terminal, else a line every nine seconds.
+    """Show a part of a command while it runs: a bar on a terminal after two seconds, else a line every nine seconds.
 
-    When it ends without an error, `say` and how long it took are printed on standard output. Loops of `track` inside
-    it are shown as its progress.
+    When it ends without an error, what was said and how long it took are printed on standard output. Loops of `track`
+    inside it, and phases inside it, are shown as its progress.
     """
     global _phase
-    found, before = Phase(name), _phase
-    _phase = found
+    outer = _phase
+    if outer is not None:
+        outer.update(0, None, name)
+        yield outer
+        outer.update(0, None)
+        return
+    _phase = found = Phase(name)
     try:
-        with _live(found) if sys.stderr.isatty() else _plain(found):
+        with _shown(found):
             yield found
     finally:
-        _phase = before
+        _phase = None
+        for line in found.lines:
+            print(line, flush=True)
     took = time.monotonic() - found.started
-    text = found.result or "done"
-    print(paragraph(name, text + (f" ({duration(took)})" if "\n" not in text and took >= 1 else "")), flush=True)
+    if found.result:
+        text = found.result + (f" ({duration(took)})" if "\n" not in found.result and took >= 1 else "")
+        print(paragraph(name, text), flush=True)
+
+
+def say(text: str) -> None:
+    """Print a line of output, at once even if that is a file; where a bar is shown, when its phase ends."""
+    if _phase is None or not sys.stderr.isatty():
+        print(text, flush=True)
+    else:
+        _phase.lines.append(text)
 
 
 @contextmanager
-def _plain(found: Phase) -> Iterator[None]:
-    """Print a line every nine seconds until the block ends."""
+def _shown(found: Phase) -> Iterator[None]:
+    """Show the state of a phase from a thread until the block ends."""
     ended = threading.Event()
-
-    def lines() -> None:
-        while not ended.wait(PLAIN_SECONDS):
-            text = found.state() or f"{duration(time.monotonic() - found.started)} so far"
-            print(paragraph(found.name, text), file=sys.stderr, flush=True)
-
-    yield from _beside(lines, ended)
-
-
-@contextmanager
-def _live(found: Phase) -> Iterator[None]:
-    """Show a bar in the last line of the terminal until the block ends."""
-    ended = threading.Event()
-    with _bar() as bar:
-        task = bar.add_task(found.name, total=found.total, completed=found.done, state=found.state())
-
-        def redraw() -> None:
-            while not ended.wait(0.25):
-                bar.update(task, total=found.total, completed=found.done, state=found.state(), refresh=True)
-
-        yield from _beside(redraw, ended)
-
-
-def _beside(work: Callable[[], None], ended: threading.Event) -> Iterator[None]:
-    """Run `work` in a thread of its own until the block ends."""
-    thread = threading.Thread(target=work, daemon=True)
+    show = _show_bar if sys.stderr.isatty() else _print_lines
+    thread = threading.Thread(target=show, args=(found, ended), daemon=True)
     thread.start()
     try:
         yield
@@ -210,44 +201,41 @@ def _beside(work: Callable[[], None], ended: threading.Event) -> Iterator[None]:
         thread.join()
 
 
-def _bar() -> "Progress":
+def _print_lines(found: Phase, ended: threading.Event) -> None:
+    while not ended.wait(PLAIN_SECONDS):
+        print(paragraph(found.name, found.state()), file=sys.stderr, flush=True)
+
+
+def _show_bar(found: Phase, ended: threading.Event) -> None:
+    """Keep the last line of the terminal up to date; it is gone afterwards."""
+    if ended.wait(SHOW_AFTER_SECONDS):
+        return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn
 
     console = Console(stderr=True)
     console.width = min(console.width, WIDTH)
     columns = (TextColumn("{task.description:<11}"), BarColumn(20), TextColumn("{task.fields[state]}"))
-    return Progress(*columns, console=console, transient=True, auto_refresh=False)
+    with Progress(*columns, console=console, transient=True, auto_refresh=False, redirect_stdout=False) as bar:
+        task = bar.add_task(found.name, state="")
+        shown = False
+        while not shown or not ended.wait(0.25):
+            bar.update(task, total=found.total, completed=found.done, state=found.state(), refresh=True)
+            shown = True
 
 
 def track(iterable: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
-    """Yield the items of `iterable`, with a bar on stderr once the work has taken two seconds.
+    """Yield the items of `iterable`; how many there were is shown as progress, inside a `phase` as that of the phase.
 
-    Shows nothing if stderr is not a terminal, for short work, and inside another tracked loop; inside a `phase` it is
-    shown as the progress of that. `total` is the number of items, by default `len(iterable)` if that exists.
+    `total` is the number of items, by default `len(iterable)` if that exists.
     """
-    global _shown
     if total is None and hasattr(iterable, "__len__"):
         total = len(iterable)  # type: ignore[arg-type]
-    if _phase is not None:
+    with nullcontext(_phase) if _phase is not None else phase(description) as shown:
+        before = shown.done, shown.total, shown.note
+        note = "" if description == shown.name else description.lower()
+        shown.update(0, total, note)  # the first item may take long
         for done, item in enumerate(iterable):
-            _phase.update(done, total, description.lower())
+            shown.update(done, total, note)
             yield item
-        return
-    if not sys.stderr.isatty():
-        yield from iterable
-        return
-    found = Phase(description)
-    with ExitStack() as stack:
-        for done, item in enumerate(iterable):
-            found.update(done, total)
-            yield item
-            if not _shown and time.monotonic() - found.started > SHOW_AFTER_SECONDS:
-                _shown = True
-                stack.enter_context(_live(found))
-                stack.callback(_hide)
-
-
-def _hide() -> None:
-    global _shown
-    _shown = False
+        shown.update(*before)

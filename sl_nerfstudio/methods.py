@@ -1,8 +1,11 @@
 """`ns-train sl-neus` and `ns-train sl-neus-paper`."""
 
 import inspect
+import sys
+from types import TracebackType
 from typing import Any
 
+import yaml
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
@@ -18,6 +21,32 @@ from sl_nerfstudio.model.trainer import SLTrainerConfig, default_device
 for _name in ("importlib._bootstrap", "importlib._bootstrap_external"):
     inspect.modulesbyfile.setdefault(f"<frozen {_name}>", _name)
 end_imports()
+
+# nerfstudio loads a run's config.yml by itself, before anything of this package can look at it.
+_excepthook = sys.excepthook
+
+
+def _explain_other_versions(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """Say in a sentence that a config.yml names what this version of the package has not; show other errors as usual.
+
+    Python's hook for errors that nobody catches.
+    """
+    if not (isinstance(error, yaml.constructor.ConstructorError) and "sl_nerfstudio" in str(error)):
+        _excepthook(kind, error, trace)
+        return
+    words = sys.argv[1:]
+    named = [word for word, before in zip(words[1:], words, strict=False) if before == "--load-config"]
+    line = f", line {error.problem_mark.line + 1}" if error.problem_mark else ""
+    print(
+        f"error: {named[0] if named else 'config.yml'}{line}: trained by another version of sl_nerfstudio\n"
+        f"    cause:  {error.problem}\n"
+        "    remedy: train again with this version, which reads the scan folder as before, or open it with the one "
+        "that trained it",
+        file=sys.stderr,
+    )
+
+
+sys.excepthook = _explain_other_versions
 
 
 def _trainer(method_name: str, model: SLModelConfig, rays: int, optimizers: dict[str, Any]) -> SLTrainerConfig:
@@ -54,7 +83,9 @@ sl_neus = MethodSpecification(
             "projector_opt": _group(FusedAdamOptimizerConfig(lr=1e-4, eps=1e-15), DecaySchedulerConfig(final=0.01)),
         },
     ),
-    description="Surface and poses of a scan with a moving pattern projector; quick with or without a GPU.",
+    description="Surface and poses of a scan with a moving pattern projector; quick with or without a GPU. Usual: "
+    "--data SCAN --output-dir DIR --timestamp NAME --max-num-iterations STEPS --pipeline.model.refine-poses "
+    "{free,rigid-rig,known-rig,static-projector,off} --pipeline.model.refine-intrinsics True; all others can stay.",
 )
 
 

@@ -272,6 +272,16 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
+def held_by_another(folder: Path) -> bool:
+    """Whether another process holds a folder, or it cannot be known."""
+    try:
+        if os.path.lexists(folder / LOCK):
+            os.close(open_alone(folder / LOCK)[0])
+    except OSError:
+        return True
+    return not os.access(folder, os.W_OK)
+
+
 @contextmanager
 def locked_file(path: Path) -> Iterator[None]:
     """Hold one file; others in its folder may be outputs of other processes."""
@@ -343,6 +353,12 @@ def remove_partial(folder: Path) -> None:
                     path.unlink()
 
 
+def files_below(root: Path) -> list[str]:
+    """All files in a folder and below it but its lock, with / between folders."""
+    found = (Path(folder, name) for folder, _, names in os.walk(root) for name in names)
+    return sorted(path.relative_to(root).as_posix() for path in found if path != root / LOCK)
+
+
 def require_empty(root: Path) -> None:
     """Raise UserError unless `root` can become a new folder: it does not exist, or is an empty folder."""
     try:
@@ -391,11 +407,17 @@ class NewFolder:
             folder.write("transforms.json", .., last=True)
     """
 
-    def __init__(self, root: Path) -> None:
-        """Take the folder. Raises UserError if it holds anything else than what a killed process left, or is in use."""
+    def __init__(self, root: Path, renews: Sequence[str] = ()) -> None:
+        """Take the folder. Raises UserError if it holds anything else than what a killed process left, or is in use.
+
+        `renews`: files of an earlier result, relative to the folder. They stay until the first new file is written, and
+        are then removed, all of them.
+        """
         self.root = root
-        self._written: list[str] = []
-        if not os.path.lexists(root / LOCK):
+        self.digests: dict[str, str] = {}
+        """SHA-256 of every file that was written."""
+        self._earlier = list(renews)
+        if not os.path.lexists(root / LOCK) and not renews:
             require_empty(root)
         self._made = made_with(root)
         try:
@@ -408,9 +430,10 @@ class NewFolder:
     def _take(self) -> None:
         try:
             left = _listed(self._lock.lines)
-            foreign = _foreign(self.root, left)
+            foreign = _foreign(self.root, [*left, *self._earlier])
             if foreign is not None:
                 raise _not_empty(self.root, foreign, self._lock)
+            left = [path for path in left if path not in self._earlier]  # of which nothing is gone yet
             _remove(self.root, left)
             if left:
                 print(f"{self.root}: removed what {self._lock.left_by} had not finished", file=sys.stderr)
@@ -427,9 +450,13 @@ class NewFolder:
         """
         if not _inside(path):
             raise ValueError(f"{path!r} leaves the folder")
+        for old in self._earlier:  # all listed before the first is gone: after a kill, the next process removes them
+            self._lock.add(json.dumps(old).encode() + b"\n")
+        _remove(self.root, self._earlier)
+        self._earlier = []
         if not last:
             self._lock.add(json.dumps(path).encode() + b"\n")
-        self._written.append(path)
+        self.digests[path] = hashlib.sha256(content).hexdigest()
         write_atomic(self.root / path, content)
 
     def __enter__(self) -> "NewFolder":
@@ -446,7 +473,7 @@ class NewFolder:
         """Let go of the folder, as at the end of the block; `complete`: keep what was written."""
         try:
             if not complete:
-                _remove(self.root, self._written)
+                _remove(self.root, list(self.digests))
         finally:
             self._lock.release()
             if not complete:

@@ -1,6 +1,7 @@
 """Set-up of all tests: one thread, no deadlines, signals as in a terminal; types checked if SL_TYPE_CHECKS is set."""
 
 import importlib
+import itertools
 import os
 import signal
 import threading
@@ -8,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ["SL_CACHE"] = os.devnull  # for fixtures of several tests: nothing is found there, or written
 
 if os.environ.get("SL_TYPE_CHECKS"):  # every call's shapes, dtypes and types: about a third slower
     import jaxtyping
@@ -46,6 +48,15 @@ def signals_as_in_a_terminal() -> Iterator[None]:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     yield
+
+
+_TESTS = itertools.count()
+
+
+@pytest.fixture(autouse=True)
+def earlier_runs_of_this_test_alone(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """No test finds what others have processed of the same captures, or what the user of this machine has."""
+    monkeypatch.setenv("SL_CACHE", str(tmp_path_factory.getbasetemp() / "caches" / str(next(_TESTS))))
 
 
 @pytest.fixture(autouse=True)

@@ -40,7 +40,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # nerfstu
 
 SMALL = [
     *("--pipeline.model.sdf.max-resolution", "64", "--pipeline.datamanager.train-num-rays-per-batch", "256"),
-    *("--pipeline.model.adjustment.other-minima", "0", "--pipeline.model.adjustment.hops", "0"),
+    *("--pipeline.model.adjustment.other-minima", "False", "--pipeline.model.adjustment.further-searches", "False"),
     *("--logging.steps-per-log", "20", "--steps-per-eval-batch", "20"),
 ]
 STEPS = 40

@@ -1,6 +1,7 @@
 """ns-train on what it cannot use: a message, status 1, nothing written."""
 
 import copy
+import dataclasses
 import json
 import math
 import subprocess
@@ -14,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import yaml
 from PIL import Image
 
 from tests.dataparser.tiny_scan import TinyScan
@@ -24,6 +26,7 @@ with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio
     from nerfstudio.scripts import train as ns_train
 
 from sl_nerfstudio.methods import sl_neus
+from sl_nerfstudio.model.trainer import SLTrainerConfig
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio emits many warnings
 
@@ -176,3 +179,27 @@ def test_the_command_itself_refuses_a_bad_scan(tmp_path: Path) -> None:
     assert "Traceback" not in done.stdout + done.stderr
     assert "coords/frame_00001.npz" in done.stderr and "remedy:" in done.stderr
     assert not list((tmp_path / "here").iterdir())
+
+
+OLD = (
+    "!!python/object:sl_nerfstudio.model.trainer.SLTrainerConfig\npipeline: !!python/object:sl_nerfstudio.{}\n  x: 1\n"
+)
+
+
+@pytest.mark.parametrize("what", ["training.pipeline.SLPipelineConfig", "model.pipeline.OldPipelineConfig"])
+def test_a_config_of_another_version_ends_in_a_sentence(what: str, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["ns-eval", "--load-config", "old/config.yml"])
+    with pytest.raises(yaml.constructor.ConstructorError) as caught:
+        yaml.load(OLD.format(what), Loader=yaml.Loader)
+    sys.excepthook(caught.type, caught.value, None)
+    said = capsys.readouterr().err
+    assert said.startswith("error: old/config.yml, line 2: trained by another version of sl_nerfstudio")
+    assert what.rpartition(".")[0] in said and "remedy: train again" in said and "Traceback" not in said
+    sys.excepthook(ValueError, ValueError("another"), None)
+    assert "ValueError: another" in capsys.readouterr().err
+
+
+def test_the_help_of_a_training_begins_with_what_its_users_set() -> None:
+    names = [field.name for field in dataclasses.fields(SLTrainerConfig)]
+    assert names[0] == "data" and names.index("pipeline") < names.index("machine") and len(names) == len(set(names))
+    assert "--pipeline.model.refine-poses" in sl_neus.description

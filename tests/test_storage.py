@@ -27,6 +27,8 @@ from sl_nerfstudio.storage import (
     Holder,
     NewFolder,
     beside,
+    files_below,
+    held_by_another,
     in_file,
     locked,
     locked_file,
@@ -416,3 +418,23 @@ def test_no_place_for_a_temporary_file_is_a_fault_of_the_user(monkeypatch, write
     monkeypatch.setattr(tempfile, "tempdir", "/dev/null/nowhere")
     with pytest.raises(UserError, match=r"temporary file.*\n.*\n.*TMPDIR"):
         write(np.zeros(3))
+
+
+def test_an_earlier_result_stays_until_the_first_new_file_and_with_anything_else_in_it_for_good(tmp_path):
+    root, old = tmp_path / "scan", ["a/x", "t"]
+    with NewFolder(root) as folder:
+        for name in old:
+            folder.write(name, b"1", last=name == "t")
+    with pytest.raises(ZeroDivisionError), NewFolder(root, old):
+        raise ZeroDivisionError
+    assert files_below(root) == old
+    (root / "mine").touch()
+    with pytest.raises(UserError, match="is not empty"):
+        NewFolder(root, old)
+    (root / "mine").unlink()
+    with NewFolder(root, old) as folder:
+        assert files_below(root) == old and held_by_another(root)
+        folder.write("b", b"2")
+        assert files_below(root) == ["b"]
+        folder.write("t", b"2", last=True)
+    assert files_below(root) == ["b", "t"] == sorted(folder.digests) and not held_by_another(root)

@@ -63,6 +63,7 @@ def main() -> None:
     given = options(__doc__, groups=[""], folder=Path("outputs/attacks"), jobs=4, keep=False, output=Path)
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(name, "1")
+    os.environ["SL_CACHE"] = os.devnull  # no run takes what another has kept of the same captures
     root = given.folder.absolute()
     make_fixtures(root / "fixtures")
     cases = all_cases()

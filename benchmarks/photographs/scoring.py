@@ -14,18 +14,29 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Bool, Float, Float32
+from jaxtyping import Bool, Float, Float32, Float64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from benchmarks.photographs.sets import CaptureSet, frame_names
+from benchmarks.photographs.sets import note_of
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.lie import Similarity, fit_similarity
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan import Frame, Scan, read_scan
 from sl_nerfstudio.scan.images import read_image
+from sl_nerfstudio.scan.types import PoseSigma
 
 _POINTS = 400  # of the object in each frame, with which poses are judged
+
+
+@dataclass(frozen=True)
+class FoundFrame:
+    """A frame where a scan, or registration alone, has it, in any axes and unit."""
+
+    name: str  # of its image
+    T_world_camera: Float64[ndarray, "4 4"]
+    T_world_projector: Float64[ndarray, "4 4"]
+    pose_sigma: PoseSigma | None
 
 
 @dataclass(frozen=True)
@@ -77,13 +88,13 @@ class Truth:
         return [name for name, frame in self.frames.items() if frame.usable]
 
 
-def read_truth(captures: Path, one: CaptureSet) -> Truth:
-    """The truth that sl-synth wrote."""
-    root = captures / "ground_truth"
+def read_truth(captures: Path) -> Truth:
+    """The truth of a folder of captures."""
+    root, numbers = captures / "ground_truth", note_of(captures)["frames"]
     scan: Scan = read_scan(root)
     recorded = json.loads((root / "captures.json").read_text())["frames"]
     frames = {}
-    for name, number in frame_names(one, len(scan.frames)).items():
+    for name, number in numbers.items():
         frame = scan.frames[number]
         mask = read_image(root / "object_masks" / f"{frame.name}.png") > 0
         frames[name] = TrueFrame(frame, scan.projector, bool(recorded[number]["usable"]), mask)
@@ -105,12 +116,17 @@ class PoseError:
     camera_deg: float
     projector_deg: float
     shift: float  # of the object, as a share of its size
-    over_sigma: float  # camera rotation error per axis over the stated sigma; NaN if none is stated
+    sigma_deg: float  # stated for the rotation of the frame as a whole, per axis; NaN if none is stated
 
     @property
     def right(self) -> bool:
         """Whether the frame is where it belongs."""
         return max(self.camera_deg, self.projector_deg) <= WRONG_DEG and self.shift <= WRONG_SHIFT
+
+    @property
+    def over_sigma(self) -> float:
+        """Camera rotation error per axis over the stated sigma."""
+        return self.camera_deg / np.sqrt(3) / self.sigma_deg
 
 
 @dataclass(frozen=True)
@@ -130,20 +146,32 @@ NOTHING_DECODED = DecodingFigures(0.0, float("nan"), float("nan"), float("nan"))
 class _Placed:
     """One frame of the scan beside its truth."""
 
-    found: Frame
+    found: FoundFrame
     true: TrueFrame
     p_scan: Float[ndarray, "n 3"]
     p_true: Float[ndarray, "n 3"]
 
 
-def pose_errors(scan: Scan, truth: Truth) -> list[PoseError]:
-    """Errors of the frames in the scan that show the object, after the alignment that most frames agree with."""
-    placed = [_placed(frame, truth.frames[frame.name]) for frame in scan.frames]
+def pose_errors(found: Sequence[FoundFrame], truth: Truth) -> list[PoseError]:
+    """Errors of the frames that show the object, after the alignment that most of them agree with."""
+    placed = [_placed(frame, truth.frames[frame.name]) for frame in found]
     placed = [p for p in placed if len(p.p_true) >= _FEWEST_POINTS]
     if not placed:
         return []
     S_truth_scan = _consensus(placed, truth.size)
     return [_error(p, S_truth_scan, truth.size) for p in placed]
+
+
+def group_sizes(found: Sequence[FoundFrame], truth: Truth) -> tuple[int, ...]:
+    """Sizes of the groups into which frames fall whose cameras are turned rightly against each other, largest first."""
+    turns = [truth.frames[f.name].frame.T_world_camera[:3, :3] @ f.T_world_camera[:3, :3].T for f in found]
+    near = np.array([[_turn_deg(a, b) <= WRONG_DEG for b in turns] for a in turns]).reshape(len(turns), len(turns))
+    left, sizes = np.ones(len(turns), dtype=bool), []
+    while left.any():
+        group = near[(near & left).sum(1).argmax()] & left
+        sizes.append(int(group.sum()))
+        left &= ~group
+    return tuple(sizes)
 
 
 def decoding_figures(work: Path, truth: Truth) -> DecodingFigures:
@@ -165,7 +193,7 @@ def decoding_figures(work: Path, truth: Truth) -> DecodingFigures:
     return DecodingFigures(len(error) / lit, float(np.median(error)), wrong, slipped)
 
 
-def _placed(found: Frame, true: TrueFrame) -> _Placed:
+def _placed(found: FoundFrame, true: TrueFrame) -> _Placed:
     p_scan = true.triangulated(found.T_world_camera, found.T_world_projector)
     p_true = true.triangulated(true.frame.T_world_camera, true.frame.T_world_projector)
     known = np.isfinite(p_scan).all(1) & np.isfinite(p_true).all(1)
@@ -206,7 +234,7 @@ def _error(placed: _Placed, S_truth_scan: Similarity, size: float) -> PoseError:
     projector = _turn_deg(S_truth_scan.R @ found.T_world_projector[:3, :3], true.T_world_projector[:3, :3])
     shift = np.linalg.norm(S_truth_scan.points(placed.p_scan) - placed.p_true, axis=1)
     sigma = float("nan") if found.pose_sigma is None else found.pose_sigma.camera_rotation_deg
-    return PoseError(found.name, camera, projector, float(np.median(shift)) / size, camera / np.sqrt(3) / sigma)
+    return PoseError(found.name, camera, projector, float(np.median(shift)) / size, sigma)
 
 
 def _turn_deg(R: Float[ndarray, "3 3"], true: Float[ndarray, "3 3"]) -> float:

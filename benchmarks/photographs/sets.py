@@ -1,12 +1,13 @@
 """The sets of captures: scenes, appearances and surroundings that no network was trained on."""
 
+import json
 import os
 import re
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.storage import write_atomic
 from sl_nerfstudio.synthesis.appearance import AppearanceKind
 from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.parts import PARTS
 from sl_nerfstudio.synthesis.render import Background
 from sl_nerfstudio.synthesis.scenes import BUILT_IN
 from sl_nerfstudio.synthesis.synthesise import synthesise
@@ -22,77 +24,84 @@ from sl_nerfstudio.synthesis.synthesise import synthesise
 PATTERN = GridPattern(w=920, h=920)
 """46 x 46 nodes: with the object filling an image of 600 pixels, a period is about 14 of them wide."""
 
-
-@dataclass(frozen=True)
-class CaptureSet:
-    """One set; `shuffled` ones come in random order, which sl-process is told only if `unordered`."""
-
-    scene: str
-    background: Background
-    appearance: AppearanceKind
-    seed: int
-    shuffled: bool = False
-    unordered: bool = False
-
-    @property
-    def name(self) -> str:
-        """A unique name, which changes with everything that changes the images."""
-        return f"{self.scene}-{self.background}-{self.appearance}-{self.seed}{'-shuffled' if self.shuffled else ''}"
-
-
-SETS = (
-    CaptureSet("frog", "none", "plain", 501), CaptureSet("dog", "table", "plain", 502),
-    CaptureSet("vase", "walls", "plain", 503), CaptureSet("chair", "none", "plain", 504, shuffled=True),
-    CaptureSet("head", "table", "realistic", 505), CaptureSet("chair", "table", "realistic", 506),
-    CaptureSet("leaf", "walls", "realistic", 507), CaptureSet("medal", "table", "realistic", 508),
-    CaptureSet("dog", "none", "realistic", 509, shuffled=True, unordered=True),
-    CaptureSet("vase", "none", "realistic", 510), CaptureSet("frog", "walls", "hard", 511),
-    CaptureSet("leaf", "table", "hard", 512), CaptureSet("chair", "walls", "hard", 513),
-    CaptureSet("cone-and-cylinder", "none", "hard", 514),
-)  # fmt: skip
-
-
-_NAME = re.compile(r"(.+)-(none|table|walls)-(plain|realistic|hard)-(\d+)(-shuffled)?")
+_NAME = re.compile(r"(.+)-(none|table|walls)-(plain|realistic|hard)-(\d+)(|-shuffled|-half)")
+SET = "set.json"
+"""What a folder of captures says of itself: `unordered`, `appearance`, and its `frames`' numbers in the truth."""
+WORK = "work"
+"""The folder of decoded frames in a folder of captures."""
+GROUPS: dict[str, tuple[str, ...]] = {
+    "objects": (
+        "frog-none-plain-501", "dog-table-plain-502", "vase-walls-plain-503", "chair-none-plain-504-shuffled",
+        "head-table-realistic-505", "chair-table-realistic-506", "leaf-walls-realistic-507",
+        "medal-table-realistic-508", "dog-none-realistic-509-shuffled", "vase-none-realistic-510",
+        "frog-walls-hard-511", "leaf-table-hard-512", "chair-walls-hard-513", "cone-and-cylinder-none-hard-514",
+    ),
+    "parts": (
+        "flange-none-plain-700", "flange-walls-plain-706-shuffled", "knob-table-plain-701", "knob-none-plain-707-half",
+        "disc-table-plain-702", "disc-none-realistic-708", "gear-table-plain-703", "gear-none-plain-709-shuffled",
+        "box-none-plain-704", "box-table-plain-710-half", "labelled-bottle-table-plain-705",
+        "labelled-bottle-walls-realistic-711",
+    ),
+    "unseen-parts": (
+        "flange-table-realistic-800", "flange-none-plain-806-half", "knob-walls-plain-801",
+        "knob-none-plain-807-shuffled", "disc-none-plain-802-half", "disc-table-plain-808-shuffled",
+        "gear-none-plain-803", "gear-walls-realistic-809", "box-table-plain-804", "box-none-plain-810-shuffled",
+        "labelled-bottle-none-plain-805-half", "labelled-bottle-table-plain-811",
+    ),
+}  # fmt: skip
+"""Lists of sets; nobody looks at what is unseen before a change is finished."""
+_TOLD = ("dog-none-realistic-509-shuffled",)  # sets of which sl-process is told that they are shuffled
 
 
-def chosen_sets(parts: Sequence[str]) -> list[CaptureSet]:
-    """The sets whose names contain one of the parts, and new ones that are named in full.
+def chosen_captures(parts: Sequence[str], frames: int, resolution: int, folder: Path) -> list[Path]:
+    """Folders of the captures of sets, rendered unless they are in `folder`.
 
-    Raises UserError if a part fits none and is no name of a set.
+    A part is the name of a list, or a part of the names of the sets in the lists, or the full name of another set, or
+    the name of any folder of captures in `folder`, or `kept`, all of these. Raises UserError for what is none of these.
     """
-    new = [_named(part) for part in parts if not any(part in one.name for one in SETS)]
-    return [one for one in SETS if not parts or any(part in one.name for part in parts)] + new
+    found: list[Path] = []
+    for part in parts:
+        there = sorted(note.parent for note in folder.glob(f"{'*' if part == 'kept' else part}/{SET}"))
+        if there or part == "kept":
+            found += there
+            continue
+        names = GROUPS.get(part) or [name for group in GROUPS.values() for name in group if part in name] or [part]
+        found += [captures_of(name, frames, resolution, folder) for name in names]
+    return list(dict.fromkeys(found))
 
 
-def _named(name: str) -> CaptureSet:
-    """A set that is not among those of the benchmark, for example "frog-table-plain-801-shuffled"."""
-    found = _NAME.fullmatch(name)
-    if found is None or found[1] not in BUILT_IN:
-        raise UserError(
-            f"--sets {name}: no set is named so; there are {', '.join(one.name for one in SETS)}; a new one is named "
-            "SCENE-BACKGROUND-APPEARANCE-SEED, with -shuffled at the end if its order is random"
-        )
-    background, appearance = cast(Background, found[2]), cast(AppearanceKind, found[3])
-    return CaptureSet(found[1], background, appearance, int(found[4]), found[5] is not None)
+def note_of(captures: Path) -> dict[str, Any]:
+    """What is in `SET`."""
+    return dict(json.loads((captures / SET).read_text()))
 
 
-def captures_of(one: CaptureSet, frames: int, resolution: int, folder: Path) -> Path:
+def captures_of(name: str, frames: int, resolution: int, folder: Path) -> Path:
     """The captures of a set below `folder`, rendered unless an earlier run did so completely."""
-    root = folder / f"{one.name}-{frames}-{resolution}"
+    parts = _NAME.fullmatch(name)
+    if parts is None or parts[1] not in {**BUILT_IN, **PARTS}:
+        raise UserError(
+            f"--sets {name}: no set is named so; there are {', '.join(chain(*GROUPS.values()))}; a new one is named "
+            "SCENE-BACKGROUND-APPEARANCE-SEED, with -shuffled at the end if its order is random, with -half if its "
+            "frames go around half of the object"
+        )
+    scene, background, appearance, seed, order = parts.groups()
+    root = folder / f"{name}-{frames}-{resolution}"
     if root.exists():
         return root
     pattern = folder / "pattern.json"
     write_atomic(pattern, PATTERN.encode())
     config = SynthConfig(
-        scene=one.scene, background=one.background, appearance=one.appearance, seed=one.seed, frames=frames,
-        resolution=resolution, pattern=pattern, images_only=True,
+        scene=scene, background=cast(Background, background), appearance=cast(AppearanceKind, appearance),
+        seed=int(seed), frames=frames, resolution=resolution, pattern=pattern,
+        path="half-turn" if order == "-half" else "hand-held", images_only=True,
     )  # fmt: skip
     # two runs side by side, or one that is interrupted, must not leave half a set under its name
     started = folder / f".{root.name}-{os.getpid()}"
     shutil.rmtree(started, ignore_errors=True)
     synthesise(config, started)
-    if one.shuffled:
-        _shuffle(started / "images", one.seed)
+    numbers = _numbers(started / "images", int(seed) if order == "-shuffled" else None)
+    note = {"unordered": name in _TOLD, "appearance": appearance, "frames": numbers}
+    (started / SET).write_text(json.dumps(note, indent=1) + "\n")
     try:
         started.rename(root)
     except OSError:
@@ -102,18 +111,13 @@ def captures_of(one: CaptureSet, frames: int, resolution: int, folder: Path) -> 
     return root
 
 
-def frame_names(one: CaptureSet, frames: int) -> dict[str, int]:
-    """Number in the truth of each image of a set."""
-    order = np.random.default_rng(one.seed).permutation(frames) if one.shuffled else np.arange(frames)
-    return {_image_name(one, place): int(number) for place, number in enumerate(order)}
-
-
-def _image_name(one: CaptureSet, place: int) -> str:
-    return f"photo_{place:03d}" if one.shuffled else f"frame_{place:05d}"
-
-
-def _shuffle(images: Path, seed: int) -> None:
-    """New names in random order."""
+def _numbers(images: Path, seed: int | None) -> dict[str, int]:
+    """Number in the truth of each image by its name; with a seed the images get names in random order."""
     found = sorted(images.iterdir())
-    for place, number in enumerate(np.random.default_rng(seed).permutation(len(found))):
-        found[number].rename(images / f"photo_{place:03d}{found[number].suffix}")
+    if seed is None:
+        return {image.stem: number for number, image in enumerate(found)}
+    numbers = {}
+    for place, number in enumerate(np.random.default_rng(seed).permutation(len(found)).tolist()):
+        image = found[number].rename(images / f"photo_{place:03d}{found[number].suffix}")
+        numbers[image.stem] = number
+    return numbers

@@ -6,7 +6,6 @@ The captures are those of `python -m benchmarks.photographs`, and frames that it
 stands around the object, the scan is made with `--object-only`.
 """
 
-import argparse
 import shutil
 import time
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from numpy import ndarray
 from benchmarks.common.measuring import Rows, options
 from benchmarks.common.runs import evaluate, export, process, train
 from benchmarks.photographs.scoring import read_truth
-from benchmarks.photographs.sets import CaptureSet, captures_of, chosen_sets
+from benchmarks.photographs.sets import WORK, chosen_captures, note_of
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.meshing.files import read_mesh
@@ -49,27 +48,26 @@ def phantom_share(mesh: Path, truth: Path, S_truth_result: Float[ndarray, "4 4"]
     return float((IndexedMesh(read_mesh(truth)).distance(placed) > farthest).mean())
 
 
-def measure(one: CaptureSet, given: argparse.Namespace) -> SurfaceFigures:
+def measure(captures: Path, jobs: int) -> SurfaceFigures:
     """Process, train, export and evaluate one set. Raises UserError if sl-process makes no scan."""
-    captures = captures_of(one, given.frames, given.resolution, given.keep)
-    scans = given.scans or given.keep / "scans"
-    scan, folder = scans / f"{captures.name}.object", scans / f"{captures.name}.run"
+    scan, folder = captures / "object", captures / "run"
     for old in (scan, folder):
         shutil.rmtree(old, ignore_errors=True)
     begin = time.monotonic()
-    more = (["--unordered"] if one.unordered else []) + ([] if one.background == "none" else ["--object-only"])
-    message = process(captures, scan, scans / f"{captures.name}.work", given.jobs, *more)
+    more = ["--unordered"] * note_of(captures)["unordered"]
+    more += ["--object-only"] if (captures / "ground_truth/surroundings.ply").exists() else []
+    message = process(captures, scan, captures / WORK, jobs, *more)
     if message:
-        raise UserError(f"{one.name}: no scan\n{message}")
+        raise UserError(f"{captures.name}: no scan\n{message}")
     mesh, poses = folder / "mesh.ply", folder / "refined"
     export(train(scan, folder, "run"), mesh, poses)
     seconds = time.monotonic() - begin
     shutil.copytree(captures / "ground_truth", scan / "ground_truth")
     found = evaluate(mesh, scan, poses, folder / "evaluation.json", "--report", folder / "report.html")
-    score, size = found["similarity"], read_truth(captures, one).size
-    mm, matrix = OBJECT_MM / size, np.array(score["matrix"])
+    score, size = found["similarity"], read_truth(captures).size
+    mm, matrix, accuracy = OBJECT_MM / size, np.array(score["matrix"]), score["accuracy"]
     return SurfaceFigures(
-        one.name, score["accuracy"]["rmse"] * mm, score["accuracy"]["median"] * mm, score["completeness"]["rmse"] * mm,
+        captures.name, accuracy["rmse"] * mm, accuracy["median"] * mm, score["completeness"]["rmse"] * mm,
         phantom_share(mesh, captures / "ground_truth/mesh.ply", matrix, PHANTOM * size), found["verdict"], seconds,
     )  # fmt: skip
 
@@ -78,11 +76,11 @@ def main() -> None:
     """Print a line for each set, and write all to JSON."""
     given = options(
         __doc__, sets=["frog-none-plain", "dog-table-plain", "head-table-realistic", "frog-walls-hard"], frames=24,
-        resolution=600, keep=Path("outputs/photographs"), scans=Path, jobs=4, output=Path,
+        resolution=600, keep=Path("outputs/photographs"), jobs=4, output=Path,
     )  # fmt: skip
     rows: Rows[SurfaceFigures] = Rows(given.output, frames=given.frames, resolution=given.resolution)
-    for one in chosen_sets(given.sets):
-        rows.add(measure(one, given))
+    for captures in chosen_captures(given.sets, given.frames, given.resolution, given.keep):
+        rows.add(measure(captures, given.jobs))
 
 
 if __name__ == "__main__":

@@ -7,33 +7,15 @@ rendering.
 """
 
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.basin_hopping import MOST_FRAMES, MOST_LEFT, Hopped, hopped, with_lost_frames
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.covariance import (
-    CovarianceEvidence,
-    departure_of,
-    drawn_start,
-    farthest_frame,
-    gauge_free,
-    pose_covariance,
-    shake,
-    widened,
-    with_frames_of,
-)
-from sl_nerfstudio.bundle_adjustment.levenberg_marquardt import moved_together
-from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
-from sl_nerfstudio.bundle_adjustment.observations import (
-    NOISE_FLOOR_PX,
-    frame_medians,
-    observe,
-    partners,
-)
+from sl_nerfstudio.bundle_adjustment.covariance import CovarianceEvidence, gauge_free, pose_covariance
+from sl_nerfstudio.bundle_adjustment.modes import Explored, Mode, explore, with_others
+from sl_nerfstudio.bundle_adjustment.observations import NOISE_FLOOR_PX, observe, partners
 from sl_nerfstudio.bundle_adjustment.parameters import (
     UNKNOWNS,
     FreeParameters,
@@ -45,41 +27,19 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     prior_equations,
     with_smooth_derivatives,
 )
+from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Rig, linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.search import (
-    FRAMES_MOVE,
     LEAST_COSINE,
-    LEAST_GAIN,
     PARTNERS,
     AdjustmentSettings,
-    SearchProblem,
-    SearchProgress,
-    SearchStage,
-    frame_support,
     kernel_of,
     problem_of,
-    run_stage,
     search,
-    unplaced_frames,
 )
 from sl_nerfstudio.geometry.devices import unproject
 from sl_nerfstudio.geometry.triangulation import closest_approach
-from sl_nerfstudio.parallel import one_library_thread, results
-
-# The adjustment, and whether its result is one of several minima.
-
-_SHAKE_SIGMAS = 2.0  # distance from the result, in its sigma, from which further steps should lead back
-_SHAKE_STEPS = 6  # most of those steps
-_WORSE = 1.4  # median residual of any frame, relative to the result's, beyond which a search has lost that frame
-
-
-@dataclass(frozen=True)
-class Searched:
-    """Beginning and ends of the searches, for the question whether there are other minima."""
-
-    problem: SearchProblem
-    refine: RefinePoses
-    ends: Hopped
+from sl_nerfstudio.parallel import one_library_thread
 
 
 @dataclass(frozen=True)
@@ -95,7 +55,8 @@ class Adjustment:
     median_after_px: float
     unplaced: tuple[int, ...]  # frames that do not agree with the others: neither their poses nor their sigma hold
     start: Rig  # to which the prior belongs: the given one, but for frames whose starting pose proved to be wrong
-    searched: Searched | None = field(default=None, repr=False)  # None: the covariance includes other minima
+    modes: tuple[Mode, ...] = ()  # other poses that remain possible, the most probable first
+    explored: Explored | None = field(default=None, repr=False)  # None: the covariance includes other minima
 
     @property
     def covariance(self) -> Float[Tensor, "unknowns unknowns"]:
@@ -129,83 +90,22 @@ def find_minimum(
     first = search(problem, refine)
     if first is None:
         return _unmoved(start, prior, free_parameters(refine, start))
-    found, before = hopped(problem, refine, first[0]), first[1]
-    again = with_lost_frames(problem, refine, found.best)
-    if again is not None:
-        problem, found = again[0], Hopped(again[1], (), found.settled)
-    return replace(_result(problem, refine, found.best, before), searched=Searched(problem, refine, found))
+    found = explore(problem, refine, first[0])
+    return replace(_result(found, first[1]), explored=found)
 
 
 @one_library_thread()
 def with_other_minima(found: Adjustment) -> Adjustment:
-    """Let the covariance cover other minima, if the poses are one of several; the poses stay."""
-    if found.searched is None:
+    """Let the covariance and the modes cover other minima, if the poses are one of several; the poses stay."""
+    if found.explored is None:
         return found
-    return replace(found, factor=widened(found.factor, _departures(found, found.searched)), searched=None)
+    factor, modes = with_others(found.explored, found.factor, found.unplaced)
+    return replace(found, factor=factor, modes=modes, explored=None)
 
 
-def _departures(result: Adjustment, searched: Searched) -> list[Float[Tensor, "unknowns"]]:
-    """Increments (delta, rho) from the result to ends of other searches, if it is one of several minima."""
-    problem, refine, found = searched.problem, searched.refine, searched.ends
-    generator = torch.Generator().manual_seed(problem.settings.seed)
-    if problem.settings.other_minima < 1 or refine not in FRAMES_MOVE or result.rig.frames > MOST_FRAMES:
-        return []
-    ends = list(found.others)
-    if not found.settled or not _shaken_leads_back(problem, refine, found.best, result, generator):
-        ends += _other_ends(problem, refine, result, generator)
-    limits = _WORSE * _misfits(problem.maps, found.best)
-    limits[list(result.unplaced)] = float("inf")
-    near = [end for end in ends if not (_misfits(problem.maps, end) > limits).any()]
-    return [departure_of(_placed_frames(end, result), result.rig) for end in near]
-
-
-def _other_ends(
-    problem: SearchProblem, refine: RefinePoses, result: Adjustment, generator: torch.Generator
-) -> list[SearchProgress]:
-    """Ends of searches from poses as uncertain as the starting ones, drawn about the result.
-
-    No frame has to agree better with the others than it does there; those that are not placed are not searched for.
-    """
-    support = frame_support(result.rig, problem.maps, result.noise_px, problem.settings)
-    expected = support.nan_to_num() - LEAST_GAIN
-    expected[list(result.unplaced)] = float("-inf")
-    searches = range(problem.settings.other_minima)
-    starts = [drawn_start(result.rig, problem.prior, refine == "free", generator) for _ in searches]
-    ends = results([partial(search, problem.again(start, start, expected), refine) for start in starts])
-    return [end[0] for end in ends if end]
-
-
-def _placed_frames(other: SearchProgress, result: Adjustment) -> Rig:
-    """The end of another search, with frames that are not placed where the result has them."""
-    return with_frames_of(other.state.rig, result.rig, result.unplaced)
-
-
-def _misfits(maps: CoordinateMaps, found: SearchProgress) -> Float[Tensor, "frames"]:
-    """Median residual of each frame's look-ups."""
-    state = found.state
-    r = residuals_of(state.rig, state.anchors, found.rows, maps)
-    return frame_medians(r, found.pairs, state.rig.frames)
-
-
-def _shaken_leads_back(
-    problem: SearchProblem, refine: RefinePoses, found: SearchProgress, result: Adjustment, generator: torch.Generator
-) -> bool:
-    """Whether some steps lead back to the result from poses beside it."""
-    state = found.state
-    delta, rho = shake(result.factor, _SHAKE_SIGMAS, generator).reshape(2, -1, 6)
-    linear = linearise(state.rig, state.anchors, found.rows, problem.maps)
-    kernel = kernel_of(state, found.rows, found.widths, linear.residuals)
-    equations = normal_equations(linear, found.rows, *kernel.weights(linear.residuals))
-    step = torch.cat([delta, rho], 1)
-    rig, anchors = moved_together(state.rig, state.anchors, equations, step)
-    beside = replace(state, rig=rig, anchors=anchors)
-    back = run_stage(problem, SearchStage(refine, False, _SHAKE_STEPS), replace(found, state=beside))
-    left = farthest_frame(result.factor, departure_of(_placed_frames(back, result), result.rig))
-    return left <= MOST_LEFT * _SHAKE_SIGMAS
-
-
-def _result(problem: SearchProblem, refine: RefinePoses, found: SearchProgress, before: float) -> Adjustment:
+def _result(explored: Explored, before: float) -> Adjustment:
     """Poses with their covariance; all residuals have full weight, whichever stage the steps ended in."""
+    problem, found = explored.problem, explored.best
     state, maps = found.state, problem.maps
     linear = linearise(state.rig, state.anchors, found.rows, maps)
     r = linear.residuals
@@ -214,7 +114,7 @@ def _result(problem: SearchProblem, refine: RefinePoses, found: SearchProgress, 
     extended = linearise_with_intrinsics(linear, state.rig, state.anchors, found.rows, maps)
     smooth = with_smooth_derivatives(extended, state.rig, state.anchors, found.rows, maps)
     evidence = CovarianceEvidence(state.rig, state.anchors, found.rows, extended, smooth, kernel)
-    free = free_parameters(refine, state.rig)
+    free = free_parameters(explored.refine, state.rig)
     factor, intrinsics = pose_covariance(evidence, free, problem.start, problem.prior, found.noise)
     return Adjustment(
         rig=state.rig,
@@ -224,7 +124,7 @@ def _result(problem: SearchProblem, refine: RefinePoses, found: SearchProgress, 
         iterations=found.iterations,
         median_before_px=before,
         median_after_px=float(r.cross[inliers].norm(dim=-1).median()),
-        unplaced=unplaced_frames(state.rig, maps, found.noise, problem.settings),
+        unplaced=explored.unplaced,
         start=problem.start,
     )
 
@@ -324,20 +224,6 @@ def _robust_squares(
     cross2 = torch.where(r.cross_valid, (r.cross**2).sum(-1), torch.full_like(r.cross[:, 0], float("inf")))
     r2 = torch.cat([own2, torch.nan_to_num(cross2, nan=float("inf"))])
     return 1 / (1 / r2.clamp_min(1e-12) + 1 / width**2)
-
-
-def mean_and_error(values: Float[Tensor, "n"], block: Int[Tensor, "n"]) -> tuple[float, float]:
-    """Mean and its standard error, if the values within a block may depend on each other in any way.
-
-    The error of a ratio of sums over blocks (Cochran, Sampling Techniques, 1977, section 6.3).
-    """
-    mean = values.mean()
-    _, index = torch.unique(block, return_inverse=True)
-    blocks = int(index.max()) + 1 if len(index) else 0
-    if blocks < 2:
-        return float(mean), float("inf")
-    sums = torch.zeros(blocks, dtype=values.dtype).index_add(0, index, values - mean)
-    return float(mean), float((blocks / (blocks - 1) * (sums**2).sum()).sqrt() / len(values))
 
 
 def _anchors(rig: Rig, held_out: HeldOutPixels) -> Anchors:

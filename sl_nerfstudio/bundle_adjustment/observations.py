@@ -224,12 +224,6 @@ def every_other(frames: int) -> Bool[Tensor, "frames frames"]:
     return ~torch.eye(frames, dtype=torch.bool)
 
 
-def involving(frame: int, frames: int) -> Bool[Tensor, "frames frames"]:
-    """Pairs of one frame and any other."""
-    involved = torch.arange(frames) == frame
-    return every_other(frames) & (involved[:, None] | involved)
-
-
 def partners(
     rig: Rig, anchors: Anchors, maps: CoordinateMaps, most: int, least_cosine: float, generator: torch.Generator
 ) -> Bool[Tensor, "frames frames"]:

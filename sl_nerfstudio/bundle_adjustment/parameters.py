@@ -88,7 +88,11 @@ class PriorTerm:
 
     def energy(self, rig: Rig) -> float:
         """The term itself; half its gradient is that of `equations`."""
-        return self.weight * float((_departure(self.start, rig) / self.prior.sigma).square().sum())
+        return float(self.energies(rig).sum())
+
+    def energies(self, rig: Rig) -> Float[Tensor, "frames"]:
+        """The term of each frame."""
+        return self.weight * (_departure(self.start, rig) / self.prior.sigma).square().sum(1)
 
     def equations(self, rig: Rig) -> tuple[Float[Tensor, "frames 12 12"], Float[Tensor, "frames 12"]]:
         """Information matrix and gradient by the increments (delta, rho) of each frame."""
@@ -302,12 +306,6 @@ def free_parameters(refine: RefinePoses, rig: Rig) -> FreeParameters:
     elif refine == "off":
         own = eye[..., :0]
     return FreeParameters(n, torch.arange(n), own, shared)
-
-
-def of_one_frame(frame: int, frames: int, with_projector: bool) -> FreeParameters:
-    """One of all frames as a whole, and on request its projector against its camera."""
-    own = torch.eye(12, dtype=torch.float64)[None, :, : 12 if with_projector else 6]
-    return FreeParameters(frames, torch.tensor([frame]), own, own[..., :0])
 
 
 def constrained(refine: RefinePoses, rig: Rig) -> Rig:

@@ -11,6 +11,7 @@ from numpy import ndarray
 from sl_nerfstudio.bundle_adjustment.adjust import Adjustment, find_minimum, with_other_minima
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import frame_sigmas
+from sl_nerfstudio.bundle_adjustment.modes import Mode
 from sl_nerfstudio.bundle_adjustment.parameters import (
     PosePrior,
     RefinePoses,
@@ -57,7 +58,7 @@ class RegisteredFramesSettings:
     """What moves: every device, frames with one relative pose for all, or frames under one projector that stays."""
     projector: ProjectorKnowledge | None = None
     """Uncertainty of a projector that was found from the captures; None: that of any calibration."""
-    adjustment: AdjustmentSettings = field(default_factory=lambda: AdjustmentSettings(lost_by_surface=False))
+    adjustment: AdjustmentSettings = field(default_factory=lambda: AdjustmentSettings(further_searches=False))
     """The bundle adjustment itself; surfaces were registered before."""
 
 
@@ -74,6 +75,7 @@ class AdjustedFrames:
     median_before_px: float  # cross-frame residual before the adjustment
     median_after_px: float
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
+    modes: tuple[Mode, ...] = ()  # other poses that remain possible, the most probable first
 
     def mapped(self, S_target_world: Similarity) -> "AdjustedFrames":
         """The same frames in other axes and another unit."""
@@ -83,7 +85,8 @@ class AdjustedFrames:
                             s.relative_rotation_deg)
             for s in self.sigma
         ]  # fmt: skip
-        return replace(self, poses=self.poses.mapped(S_target_world), sigma=tuple(sigma))
+        modes = tuple(mode.turned(S_target_world.R) for mode in self.modes)
+        return replace(self, poses=self.poses.mapped(S_target_world), sigma=tuple(sigma), modes=modes)
 
     def scaled(self, factor: float) -> "AdjustedFrames":
         """The same frames with all lengths multiplied."""
@@ -100,9 +103,10 @@ class RegisteredMinimum:
 
     def with_other_minima(self) -> AdjustedFrames:
         """Let sigma cover how far other minima are, which takes several more searches; the poses stay."""
-        index = np.flatnonzero([s is not None for s in self.frames.sigma]).tolist()
-        sigma = _stated_sigma(with_other_minima(self.adjustment), self.unit)
-        return replace(self.frames, sigma=_sigmas_among_all(sigma, index, len(self.frames.sigma)))
+        index, found = np.flatnonzero([s is not None for s in self.frames.sigma]), with_other_minima(self.adjustment)
+        sigma = _sigmas_among_all(_stated_sigma(found, self.unit), index.tolist(), len(self.frames.sigma))
+        modes = tuple(replace(mode, frames=tuple(index[list(mode.frames)].tolist())) for mode in found.modes)
+        return replace(self.frames, sigma=sigma, modes=modes)
 
 
 def adjust_registered(

@@ -1,9 +1,4 @@
-"""One search for the poses: steps in stages with a narrowing kernel; frames that were lost on the way placed again.
-
-A frame that ended in a wrong minimum while the others agreed is placed on its own: with all others fixed it has six
-unknowns and thousands of residuals. Starting with a wide kernel, and from a few poses around its current one, it finds
-the surface that the others agree on.
-"""
+"""One search for the poses: steps in stages with a narrowing kernel."""
 
 from dataclasses import dataclass, replace
 
@@ -18,7 +13,6 @@ from sl_nerfstudio.bundle_adjustment.observations import (
     Kernel,
     away_from_borders,
     frame_medians,
-    involving,
     narrowed,
     noise_of,
     noise_ratios,
@@ -32,7 +26,6 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     PriorTerm,
     RefinePoses,
     free_parameters,
-    of_one_frame,
     rough_weight,
 )
 from sl_nerfstudio.bundle_adjustment.residuals import (
@@ -47,7 +40,6 @@ from sl_nerfstudio.bundle_adjustment.residuals import (
 )
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.devices import project
-from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
 
 FRAMES_MOVE = ("free", "rigid-rig", "known-rig")
 """What may be refined if single frames are to move by themselves."""
@@ -63,19 +55,11 @@ _KERNEL_NOISES = 3.0  # smallest width, in estimated noises
 _CONVERGED = 1e-4  # largest component of a step, scene units or radian, below which the poses have converged
 _SETTLED = 0.98  # share of its last width above which a kernel counts as no longer narrowing
 
-# Frames that are lost.
-_ROUNDS = 3  # of searching; frames that were found help to find the others
-_LOST_ANCHORS = 200  # decoded pixels of each frame that are used
+# Frames that agree with the others.
 EVERY_FRAME_PER_ANCHOR = 16  # in which an anchor is looked up where every frame that may see it is asked
-_MOST_RESIDUALS = 6000  # between one frame and all others
-_STARTS = 12  # starting poses for a lost frame, drawn from the prior
-_FRAME_STEPS = 10  # from each, in which the frame moves as a whole
-_PROJECTOR_STEPS = 10  # after those, in which its projector moves, too
-_LOST_OBSERVE_EVERY = 3
+_JUDGED_ANCHORS = 200  # decoded pixels of each frame that are used
 _INLIER_NOISES = 5.0  # largest residual that supports a pose
-LEAST_GAIN = 0.01  # share of supporting residuals that a new pose must add to replace the old one
-_LOST_SIGMAS = 4.0  # robust standard deviations below the median frame's support at which a frame is lost,
-_LEAST_SHARE, _MOST_SHARE = 0.75, 0.95  # always below the first share of that, and never above the second
+_LEAST_SUPPORT = 0.75  # share of residuals that support a frame's pose, relative to the median frame's
 
 
 @dataclass(frozen=True)
@@ -92,12 +76,10 @@ class AdjustmentSettings:
     """Most Levenberg-Marquardt steps."""
     seed: int = 0
     """Seed of the choice of pixels."""
-    other_minima: int = 3
-    """Searches from other starting poses if a result turns out to be one of several minima; 0: none."""
-    hops: int = 12
-    """Most further searches after rough starts, each begun beside the best end so far; 0: none."""
-    lost_by_surface: bool = True
-    """Whether frames that agree with no others after all searches are looked for by their surfaces."""
+    further_searches: bool = True
+    """Whether rough starts, and frames that agree with no others, are searched from more places than where they are."""
+    other_minima: bool = True
+    """Whether further searches show how far other minima are, if a result turns out to be one of several."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +94,6 @@ class SearchProblem:
     generator: torch.Generator
     partners: Bool[Tensor, "frames frames"]
     anchors: Anchors  # where they are at its beginning
-    expected: Float[Tensor, "frames"]  # support of each frame with which it is not lost; -inf: it is never searched for
 
     def observe(self, state: LMState) -> Observations:
         """A new choice of which frame looks up which anchor; no residual is too large to be used."""
@@ -120,10 +101,6 @@ class SearchProblem:
             state.rig, state.anchors, self.maps, self.settings.frames_per_anchor, float("inf"), LEAST_COSINE,
             self.generator, self.partners,
         )  # fmt: skip
-
-    def again(self, start: Rig, begin: Rig, expected: Float[Tensor, "frames"]) -> "SearchProblem":
-        """Another search with the same measurements, which expects that support of each frame."""
-        return replace(problem_of(start, self.maps, self.prior, self.settings, begin), expected=expected)
 
 
 @dataclass(frozen=True)
@@ -140,11 +117,6 @@ class SearchProgress:
     def pairs(self) -> Int[Tensor, "2 rows"]:
         """Frame of the anchor, frame that looks it up."""
         return self.rows.pairs(self.state.anchors)
-
-    def at(self, rig: Rig, moved: Bool[Tensor, "frames"]) -> "SearchProgress":
-        """Continue with some frames at other poses; the kernels of those frames are wide again."""
-        widths = torch.where(moved, torch.full_like(self.widths, float("inf")), self.widths)
-        return replace(self, state=replace(self.state, rig=rig), widths=widths)
 
 
 def kernel_of(state: LMState, rows: Observations, widths: Float[Tensor, "frames"], r: Residuals) -> Kernel:
@@ -163,8 +135,7 @@ def problem_of(
     per_frame = max(per_frame, min(_LEAST_ANCHORS, settings.anchors_per_frame))
     anchors = place_anchors(begin, maps, per_frame, generator)
     together = partners(begin, anchors, maps, PARTNERS, LEAST_COSINE, generator)
-    whatever = torch.full((start.frames,), float("inf"), dtype=torch.float64)
-    return SearchProblem(start, begin, maps, prior, settings, generator, together, anchors, whatever)
+    return SearchProblem(start, begin, maps, prior, settings, generator, together, anchors)
 
 
 @dataclass(frozen=True)
@@ -217,149 +188,20 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
     return found
 
 
-def rows_of_all(
-    rig: Rig, anchors: Anchors, maps: CoordinateMaps, generator: torch.Generator, around: int | None = None
-) -> Observations:
-    """Every anchor in other frames that may see it; with `around`, only anchors of or in one frame."""
-    if around is None:
-        allowed = partners(rig, anchors, maps, PARTNERS, LEAST_COSINE, generator)
-    else:
-        allowed = involving(around, rig.frames)
-    return observe(rig, anchors, maps, EVERY_FRAME_PER_ANCHOR, float("inf"), LEAST_COSINE, generator, allowed)
-
-
-def support_of(
-    rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps, noise: float
-) -> Float[Tensor, "frames"]:
-    """Share of residuals within the noise, of those each frame takes part in; NaN where there are none."""
-    r = residuals_of(rig, anchors, rows, maps)
-    inlier = r.cross_valid & (r.cross.norm(dim=-1) < _INLIER_NOISES * noise)
-    counts = torch.zeros(2, rig.frames, dtype=torch.float64)
-    for frame in rows.pairs(anchors):
-        for k, counted in enumerate((inlier, r.cross_valid)):
-            counts[k] += torch.bincount(frame[counted], minlength=rig.frames)
-    return counts[0] / counts[1]
-
-
-def frame_support(
-    rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings
-) -> Float[Tensor, "frames"]:
-    """Share of residuals within the noise of each frame, the same ones of the same poses; NaN where there are none."""
-    generator = torch.Generator().manual_seed(settings.seed)
-    anchors = place_anchors(rig, maps, _LOST_ANCHORS, generator)
-    return support_of(rig, anchors, rows_of_all(rig, anchors, maps, generator), maps, noise)
-
-
 def unplaced_frames(rig: Rig, maps: CoordinateMaps, noise: float, settings: AdjustmentSettings) -> tuple[int, ...]:
     """Frames that see too little of the surface on which the others agree, in order."""
-    support = frame_support(rig, maps, noise, settings)
-    wrong = support.isnan() | (support < _LEAST_SHARE * support.nanmedian())
+    generator = torch.Generator().manual_seed(settings.seed)
+    anchors = place_anchors(rig, maps, _JUDGED_ANCHORS, generator)
+    allowed = partners(rig, anchors, maps, PARTNERS, LEAST_COSINE, generator)
+    rows = observe(rig, anchors, maps, EVERY_FRAME_PER_ANCHOR, float("inf"), LEAST_COSINE, generator, allowed)
+    r, frames = residuals_of(rig, anchors, rows, maps), rows.pairs(anchors)
+    inlier = r.cross_valid & (r.cross.norm(dim=-1) < _INLIER_NOISES * noise)
+    agreeing, judged = (
+        torch.bincount(frames[:, kept].flatten(), minlength=rig.frames) for kept in (inlier, r.cross_valid)
+    )
+    support = agreeing.double() / judged
+    wrong = support.isnan() | (support < _LEAST_SUPPORT * support.nanmedian())
     return tuple(wrong.nonzero().squeeze(-1).tolist())
-
-
-def least_support(support: Float[Tensor, "frames"]) -> float:
-    """The smallest support with which a frame counts as placed.
-
-    It is some robust standard deviations below the median frame's, but always between two shares of that.
-    """
-    middle = support.nanmedian()
-    sigma = MAD_TO_SIGMA * (support - middle).abs().nanmedian()
-    return float((middle - _LOST_SIGMAS * sigma).clamp(_LEAST_SHARE * middle, _MOST_SHARE * middle))
-
-
-def find_lost_frames(support: Float[Tensor, "frames"]) -> Int[Tensor, "lost"]:
-    """Frames with far less support than most others, those with the most support first."""
-    lost = (support < least_support(support)).nonzero().squeeze(-1)
-    return lost[support[lost].argsort(descending=True)]
-
-
-@dataclass(frozen=True)
-class Relocalised:
-    """Result of a search for lost frames."""
-
-    rig: Rig
-    found: tuple[int, ...]  # frames that the others support now
-    in_vain: tuple[int, ...]  # frames that they do not, even where they are supported better than before
-
-
-def relocalise(
-    problem: SearchProblem, refine: RefinePoses, rig: Rig, noise: float, expected: Float[Tensor, "frames"]
-) -> Relocalised:
-    """The rig with lost frames moved to poses that the other frames support; a frame without a better pose stays.
-
-    The search covers poses around the current one, as far as the prior is uncertain. If projectors are free, the frame
-    starts with its original relative pose, because one that was adjusted at a wrong pose of the frame is useless.
-    A frame with the support that is `expected` of it, or with enough of it, is not searched for.
-    """
-    maps, prior, generator = problem.maps, problem.prior, problem.generator
-    anchors = place_anchors(rig, maps, _LOST_ANCHORS, generator)
-    support = support_of(rig, anchors, rows_of_all(rig, anchors, maps, generator), maps, noise)
-    lost = find_lost_frames(support)
-    placed = ~torch.isin(torch.arange(rig.frames), lost) & support.isfinite()
-    searched = [k for k in lost.tolist() if support[k] < expected[k]]
-    usual = least_support(support)
-    for k in searched:
-        enough = min(usual, float(expected[k]))
-        best, best_support = rig, float(support[k]) + LEAST_GAIN
-        for attempt in range(_STARTS):
-            delta = torch.zeros(rig.frames, 6, dtype=torch.float64)
-            if attempt:
-                delta[k] = prior.sigma[k, :6] * torch.randn(6, generator=generator, dtype=torch.float64)
-            relative = rig.T_camera_projector.clone()
-            if refine == "free":
-                relative[k] = problem.start.T_camera_projector[k]
-            there = replace(rig, T_camera_projector=relative).moved(delta, torch.zeros_like(delta))
-            found, found_support = _place_one(problem, refine, there, anchors, k, placed, noise)
-            if found_support > best_support:
-                best, best_support = found, found_support
-            if best_support > enough:
-                break
-        rig = best
-        placed[k] = best_support > enough
-    return Relocalised(rig, tuple(k for k in searched if placed[k]), tuple(k for k in searched if not placed[k]))
-
-
-def _place_one(
-    problem: SearchProblem, refine: RefinePoses, rig: Rig, all_anchors: Anchors, k: int, placed: Bool[Tensor, "frames"],
-    noise: float,
-) -> tuple[Rig, float]:  # fmt: skip
-    """Move frame k alone, first as a whole, then its projector too; returns the rig and the frame's support in it."""
-    n, maps = rig.frames, problem.maps
-    allowed = placed.clone()
-    allowed[k] = True
-
-    def rows_near(rig: Rig) -> tuple[Int[Tensor, "n"], Observations]:
-        """Numbers of anchors that take part, and their rows; a random subset of these if there are too many."""
-        rows, frame = rows_of_all(rig, all_anchors, maps, problem.generator, k), all_anchors.frame
-        chosen = (allowed[frame[rows.anchor]] & allowed[rows.frame]).nonzero().squeeze(-1)
-        chosen = chosen[torch.randperm(len(chosen), generator=problem.generator)[:_MOST_RESIDUALS]]
-        taking_part = frame == k
-        taking_part[rows.anchor[chosen]] = True
-        number = torch.cumsum(taking_part, 0) - 1
-        return taking_part.nonzero().squeeze(-1), Observations(number[rows.anchor[chosen]], rows.frame[chosen])
-
-    width = torch.full((n,), float("inf"), dtype=torch.float64)
-    anchors, (number, rows) = all_anchors, rows_near(rig)
-    state = LMState(rig, anchors.chosen(number), DAMPING)
-    for step in range(_FRAME_STEPS + (_PROJECTOR_STEPS if refine == "free" else 0)):
-        if step and step % _LOST_OBSERVE_EVERY == 0:
-            anchors = anchors.at(anchors.depth.index_copy(0, number, state.anchors.depth))
-            number, rows = rows_near(state.rig)
-            state = replace(state, anchors=anchors.chosen(number))
-        linear = linearise(state.rig, state.anchors, rows, maps)
-        if not linear.residuals.cross_valid.any():
-            return rig, 0.0
-        pair = rows.pairs(state.anchors)
-        target = _KERNEL_MEDIANS * float(frame_medians(linear.residuals, pair, n)[k])
-        width = narrowed(width, torch.full_like(width, target)).clamp_min(_KERNEL_NOISES * noise)
-        weight = rough_weight(noise, float(linear.residuals.cross_valid.sum()), INDEPENDENT)
-        term = PriorTerm(problem.prior, problem.start, weight)
-        kernel = Kernel(width, state.anchors.frame, pair)
-        free = of_one_frame(k, n, with_projector=step >= _FRAME_STEPS)
-        state = lm_step(state, linear, rows, maps, kernel, term, free)
-    number, rows = rows_near(state.rig)
-    support = support_of(state.rig, all_anchors.chosen(number), rows, maps, noise)[k]
-    return state.rig, float(support.nan_to_num())
 
 
 def search(problem: SearchProblem, refine: RefinePoses) -> tuple[SearchProgress, float] | None:
@@ -376,7 +218,6 @@ def search(problem: SearchProblem, refine: RefinePoses) -> tuple[SearchProgress,
     *rough, last = stages(refine, settings)
     for stage in rough:
         found = run_stage(problem, stage, found)
-    found = _relocalised(problem, refine, rough[-1], found)
     found = _away_from_borders(problem, found)
     found = run_stage(problem, replace(last, iterations=max(settings.max_iterations - found.iterations, 1)), found)
     return found, before
@@ -402,25 +243,3 @@ def _away_from_borders(problem: SearchProblem, found: SearchProgress) -> SearchP
     least += min(least, maps.half_window)
     anchors, rows = away_from_borders(anchors, rows, (own, seen), least, state.rig.frames)
     return replace(found, state=replace(state, anchors=anchors), rows=rows)
-
-
-def _relocalised(
-    problem: SearchProblem, refine: RefinePoses, stage: SearchStage, found: SearchProgress
-) -> SearchProgress:
-    """Place lost frames again and adjust everything with them, until no frame moves any more.
-
-    A frame that was searched for in vain is searched for again only when others were found.
-    """
-    if refine not in FRAMES_MOVE:
-        return found
-    expected = problem.expected.clone()
-    for _ in range(_ROUNDS):
-        again = relocalise(problem, refine, found.state.rig, found.noise, expected)
-        moved = (again.rig.T_world_camera != found.state.rig.T_world_camera).flatten(1).any(1)
-        if not moved.any():
-            break
-        found = run_stage(problem, stage, found.at(again.rig, moved))
-        if again.found:
-            expected = problem.expected.clone()
-        expected[list(again.in_vain)] = float("-inf")
-    return found

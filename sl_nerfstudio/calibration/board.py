@@ -45,6 +45,7 @@ from sl_nerfstudio.calibration.board_adjustment import (
     sightings,
 )
 from sl_nerfstudio.geometry.devices import DEVICE_FIELDS, PARAMETERS, Device, DeviceKind, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
 from sl_nerfstudio.pattern.boards import Board, Chessboard
 
 # The choice of the model.
@@ -84,7 +85,7 @@ class LeftOut:
 
 def choose_models(start: AdjustedBoard, seen: Seen, track: Track) -> tuple[Free, tuple[ModelScore, ...]]:
     """The model of each device, and what was compared: first the terms of the lens, then two focal lengths."""
-    free: Free = (FreeIntrinsics(), *(_RICH for _ in start.rig.devices[1:]))
+    free: Free = (start.free[0], *(replace(_RICH, aspect=one.aspect) for one in start.free[1:]))
     sigma = adjust(start.rig, tuple(_RICHEST for _ in free), seen).sigma_px
     scores: list[ModelScore] = []
     for device, name in enumerate(("camera", "projector")[: len(free)]):
@@ -94,8 +95,10 @@ def choose_models(start: AdjustedBoard, seen: Seen, track: Track) -> tuple[Free,
             found = leave_out(start.rig, tried, seen, sigma)
             return ModelScore(device, model, found.error_px, found.costs, found.whole.rig.devices[device])
 
-        found = [score(FreeIntrinsics(False, terms)) for terms in track(_TERMS, f"Lens models of the {name}")]
-        found.append(score(FreeIntrinsics(True, found[_simplest(found)].model.terms)))
+        aspect = start.free[device].aspect
+        found = [score(FreeIntrinsics(aspect, terms)) for terms in track(_TERMS, f"Lens models of the {name}")]
+        if not aspect:
+            found.append(score(FreeIntrinsics(True, found[_simplest(found)].model.terms)))
         best = _simplest(found)
         scores += [replace(one, chosen=k == best) for k, one in enumerate(found)]
         free = (*free[:device], found[best].model, *free[device + 1 :])
@@ -206,6 +209,46 @@ def formal_sigmas(free: Free, information: Float64[ndarray, "s s"]) -> list[Floa
         out.append(np.sqrt(np.einsum("ps,st,pt->p", columns, found[part, part], columns).clip(0)))
         place += columns.shape[1]
     return out
+
+
+# Whether the lens is what its model says: corners that lie nearer to the middle of the image, or farther, than they
+# should, by how far out they are. A polynomial that is too short for a lens alternates between the two.
+
+_RINGS, _FEWEST_VIEWS, _FEWEST_OF_VIEW = 8, 3, 3
+_RING_CHI_SQUARE = 30.0  # of all rings together; about as much as there are rings if the model is right
+_WIDE = 0.6  # radius of the outermost corners in focal lengths, 31 degrees: narrower lenses have no such terms
+_RING_SHARE = 0.25  # of the corners' noise: less matters to nothing
+
+
+@dataclass(frozen=True)
+class RadialMisfit:
+    """How far corners lie outside of where the lens puts them, in the rings where that is largest; pixels."""
+
+    inwards_px: float  # not positive
+    outwards_px: float  # not negative
+
+
+def radial_misfit(device: Device, seen: CornerSightings, residual: Float64[ndarray, "n 2"]) -> RadialMisfit | None:
+    """What is left along the radius of a wide lens, in rings; None where it is chance, or below the noise.
+
+    `residual` is seen minus predicted. Corners of a view share errors, so a ring is as certain as its views agree.
+    """
+    out = seen.uv - (device.cx, device.cy)
+    radius = np.linalg.norm(out, axis=1)
+    along = (residual * out).sum(1) / radius.clip(1e-9)
+    noise = MAD_TO_SIGMA * float(np.median(np.abs(residual - np.median(residual, 0))))
+    middles, chi_square = [0.0], 0.0
+    for ring in np.array_split(np.argsort(radius), _RINGS):
+        of_view = [along[ring][seen.view[ring] == k] for k in np.unique(seen.view[ring])]
+        medians = np.array([np.median(values) for values in of_view if len(values) >= _FEWEST_OF_VIEW])
+        if len(medians) >= _FEWEST_VIEWS:
+            middles.append(float(np.median(medians)))
+            sigma = max(float(medians.std(ddof=1)), _RING_SHARE * noise) / np.sqrt(len(medians))
+            chi_square += float(medians.mean() / sigma) ** 2
+    wide = float(np.quantile(radius, 0.98)) > _WIDE * device.fl_x
+    if not wide or chi_square < _RING_CHI_SQUARE or max(map(abs, middles)) < _RING_SHARE * noise:
+        return None
+    return RadialMisfit(min(middles), max(middles))
 
 
 # How varied the views are, and which further pose of the board would help most.
@@ -337,6 +380,7 @@ class BoardCalibration:
     models: tuple[ModelScore, ...]
     coverage: Coverage
     next_pose: NextPose | None
+    misfit: RadialMisfit | None  # of the camera's lens; a projector's corners come through a homography each
 
     @property
     def camera(self) -> Device:
@@ -386,6 +430,7 @@ def calibrate(
         models,
         coverage_of(adjusted, views),
         next_pose(adjusted, p_board),
+        radial_misfit(adjusted.rig.camera, seen[0], all_residuals[0]),
     )
 
 

@@ -8,6 +8,7 @@ cost little.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -28,6 +29,8 @@ _TOLERANCE, _FIRST_DAMPING = 1e-6, 1e-5  # share of the cost that may be left to
 _PLACING_STEPS = 4
 _SINGULAR = 1e-14  # of the largest eigenvalue, with all numbers scaled alike
 _FOCAL_LENGTHS = (0.6, 1.0, 1.6, 2.5, 4.0)  # in widths of the image
+_ASPECTS = (1.0, 0.5, 0.7, 1.4, 2.0)  # fl_y over fl_x: pixels need not be square
+_SQUARE = 2.0  # noise with square pixels, relative to that with two focal lengths: up to here they are taken as square
 _CENTRES = (0.5, 1.0, 0.0, 1.3, -0.3)  # principal point of a projector, in heights of the pattern: lens shift
 _TRIED = 3  # of the starts that fit best, how many are adjusted
 _AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenCV's device axes and ours
@@ -322,14 +325,14 @@ def _exp(twists: Float64[ndarray, "n 6"]) -> Float64[ndarray, "n 4 4"]:
 def camera_start(views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"]) -> AdjustedBoard:
     """The camera without lens distortion, and the boards."""
     w, h = size
-    focals = [*(share * max(size) for share in _FOCAL_LENGTHS), *_closed_form(views, size, p_board)]
+    focals = [(share * max(size), aspect * share * max(size)) for share in _FOCAL_LENGTHS for aspect in _ASPECTS]
     found: list[tuple[float, BoardRig]] = []
-    for focal in focals:
-        camera = Device(w, h, focal, focal, w / 2, h / 2)
+    for fl_x, fl_y in [*focals, *_closed_form(views, size, p_board)]:
+        camera = Device(w, h, fl_x, fl_y, w / 2, h / 2)
         solved = [_pose(camera, p_board, view.camera) for view in views]
         T = np.array([pose for pose, _ in solved])
         found.append((float(sum(cost for _, cost in solved)), BoardRig(camera, None, T, np.eye(4))))
-    return _best(found, (FreeIntrinsics(),), sightings(views, p_board)[:1])
+    return _best(found, (), sightings(views, p_board)[:1])
 
 
 def projector_start(
@@ -339,23 +342,36 @@ def projector_start(
     points, pixels = _seen_by_projector(camera.rig, views, p_board)
     w, h = size
     found: list[tuple[float, BoardRig]] = []
-    for focal in _FOCAL_LENGTHS:
-        for centre in _CENTRES:
-            device = Device(w, h, focal * w, focal * w, w / 2, centre * h, model=model)
-            T, cost = _pose(device, points, Corners(np.arange(len(points)), pixels))
-            rig = BoardRig(camera.rig.camera, device, camera.rig.T_camera_board, T)
-            found.append((cost, rig))
-    return _best(found, (*camera.free, FreeIntrinsics()), sightings(views, p_board))
+    for focal, aspect, centre in product(_FOCAL_LENGTHS, _ASPECTS, _CENTRES):
+        device = Device(w, h, focal * w, aspect * focal * w, w / 2, centre * h, model=model)
+        T, cost = _pose(device, points, Corners(np.arange(len(points)), pixels))
+        found.append((cost, BoardRig(camera.rig.camera, device, camera.rig.T_camera_board, T)))
+    return _best(found, camera.free, sightings(views, p_board))
 
 
-def _best(found: list[tuple[float, BoardRig]], free: Free, seen: Seen) -> AdjustedBoard:
-    """The best solution from the starts that fit best."""
-    tried = sorted(found, key=lambda one: one[0])[:_TRIED]
-    return min((adjust(rig, free, seen) for _, rig in tried), key=lambda one: one.sigma_px[-1])
+def _best(found: list[tuple[float, BoardRig]], known: Free, seen: Seen) -> AdjustedBoard:
+    """The best solution from the starts that fit best, with square pixels of the last device if they explain as much.
+
+    `known` are the free intrinsics of the devices before the last.
+    """
+    ordered = [rig for _, rig in sorted(found, key=lambda one: one[0])]
+
+    def best(square: bool) -> AdjustedBoard:
+        free = (*known, FreeIntrinsics(aspect=not square))
+        starts = [rig for rig in ordered if (rig.devices[-1].fl_x == rig.devices[-1].fl_y) == square]
+        return min((adjust(rig, free, seen) for rig in starts[:_TRIED]), key=lambda one: one.sigma_px[-1])
+
+    square, other = best(True), best(False)
+    return square if square.sigma_px[-1] < _SQUARE * other.sigma_px[-1] else other
 
 
-def _closed_form(views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"]) -> Iterator[float]:
-    """The common focal length from all homographies, with the principal point in the middle; nothing if imaginary."""
+def _closed_form(
+    views: Sequence[BoardView], size: Size, p_board: Float64[ndarray, "m 3"]
+) -> Iterator[tuple[float, float]]:
+    """One focal length for both axes, then two, from all homographies, with the principal point in the middle.
+
+    Those that are imaginary are left out.
+    """
     rows, right = [], []
     for view in views:
         if len(view.camera.ids) < _LEAST_CORNERS:
@@ -365,12 +381,14 @@ def _closed_form(views: Sequence[BoardView], size: Size, p_board: Float64[ndarra
             continue
         first, second = H[:, 0], H[:, 1]
         scale = np.linalg.norm(first) * np.linalg.norm(second)
-        rows += [first[:2] @ second[:2] / scale, (first[:2] @ first[:2] - second[:2] @ second[:2]) / scale]
+        rows += [first[:2] * second[:2] / scale, (first[:2] ** 2 - second[:2] ** 2) / scale]
         right += [-first[2] * second[2] / scale, (second[2] ** 2 - first[2] ** 2) / scale]
-    if rows:
-        squared = float(np.dot(rows, rows) / np.dot(rows, right)) if np.dot(rows, right) else -1.0
-        if squared > 0:
-            yield float(np.clip(np.sqrt(squared), 0.2 * max(size), 50 * max(size)))
+    by_axis, least = np.array(rows).reshape(-1, 2), 0.2 * max(size)
+    for columns in (by_axis.sum(1, keepdims=True), by_axis) if rows else ():
+        inverse = np.linalg.lstsq(columns, np.array(right), rcond=None)[0]
+        if (inverse > 0).all():
+            focal = np.clip(1 / np.sqrt(inverse), least, 250 * least)
+            yield float(focal[0]), float(focal[-1])
 
 
 def _pose(device: Device, points: Float64[ndarray, "m 3"], corners: Corners) -> tuple[Float64[ndarray, "4 4"], float]:

@@ -66,6 +66,7 @@ class BoardCaptures:
     views: tuple[BoardView, ...]
     pictures: tuple[BoardPicture, ...]  # of every pose, used or not
     faults: tuple[FileError, ...]  # of the poses that are not used
+    noted: tuple[tuple[str, tuple[str, ...]], ...] = ()  # name of every pose that is used, and the decoder's notes
 
 
 def read_board_captures(
@@ -75,16 +76,17 @@ def read_board_captures(
 
     A pose whose board is not found, or whose pattern cannot be decoded, is a fault, and is not used.
     """
-    views, pictures, faults = [], [], []
+    views, pictures, faults, noted = [], [], [], []
     for pose in track(poses, "Finding the board"):
         try:
-            grey, corners, view = _read_pose(pose, board, decoder)
+            grey, corners, view, notes = _read_pose(pose, board, decoder)
+            noted.append((pose.name, notes))
             pictures.append(BoardPicture(pose.name, grey, corners, None))
             views.append(view)
         except _Unused as unused:
             faults.append(unused.fault)
             pictures.append(BoardPicture(pose.name, unused.grey, unused.corners, unused.fault.problem))
-    return BoardCaptures(tuple(views), tuple(pictures), tuple(faults))
+    return BoardCaptures(tuple(views), tuple(pictures), tuple(faults), tuple(noted))
 
 
 class _Unused(Exception):
@@ -96,7 +98,7 @@ class _Unused(Exception):
 
 def _read_pose(
     pose: BoardPhotographs, board: Board, decoder: Decoder[Any] | None
-) -> tuple[Float32[ndarray, "h w"], Corners, BoardView]:
+) -> tuple[Float32[ndarray, "h w"], Corners, BoardView, tuple[str, ...]]:
     decode: Callable[[], Decoded] | None
     if isinstance(decoder, NetworkDecoder):
         pattern, grey = _pattern_and_plain(pose)
@@ -108,13 +110,13 @@ def _read_pose(
     if corners is None:
         raise _Unused(_not_found(pose, grey, board), grey)
     if decode is None:
-        return grey, corners, BoardView(pose.name, corners, None)
+        return grey, corners, BoardView(pose.name, corners, None), ()
     folder = pose.images[0].parent
     try:
-        coords = decode().coords
+        decoded = decode()
     except DecodingError as error:
         raise _Unused(FileError(folder, error.problem, error.cause, error.remedy), grey, corners) from error
-    carried = corners_in_pattern(corners, coords)
+    carried = corners_in_pattern(corners, decoded.coords)
     if len(carried.ids) < LEAST_IN_PATTERN:
         fault = FileError(
             folder,
@@ -123,7 +125,7 @@ def _read_pose(
             "capture this pose again with the whole board lit, or leave its folder out",
         )
         raise _Unused(fault, grey, corners)
-    return grey, corners, BoardView(pose.name, corners, carried)
+    return grey, corners, BoardView(pose.name, corners, carried), decoded.notes
 
 
 def _even_light(pose: BoardPhotographs, decoder: Decoder[Any] | None) -> Float32[ndarray, "h w"]:

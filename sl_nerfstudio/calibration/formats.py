@@ -1,18 +1,15 @@
 """The camera or the projector in an intrinsics file: its format, the right entry, and whether it can be used."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
-from xml.etree import ElementTree
 
 import numpy as np
-import yaml
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.errors import UserError, first_line
+from sl_nerfstudio.calibration.stored_values import STORED, read_stored_values
 from sl_nerfstudio.geometry.devices import Device, DeviceKind
 from sl_nerfstudio.scan.document import Faults, Fields, FileError, document_faults, read_bytes, read_document
 from sl_nerfstudio.scan.images import MAX_PIXELS
@@ -21,7 +18,7 @@ from sl_nerfstudio.scan.types import device_problems
 # A device as a file describes it.
 
 Role = Literal["camera", "projector"]
-LENS_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order
+LENS_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4")  # OpenCV's order
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class DeviceEntry:
     role: Role | None  # None: the file does not say
     size: tuple[int, int] | None  # (w, h); None: the file does not say
     matrix: Float64[ndarray, "3 3"]
-    distortion: tuple[float, ...]  # the first four to eight of LENS_TERMS
+    distortion: tuple[float, ...]  # the first four to twelve of LENS_TERMS
     model: DeviceKind = "OPENCV"
     sigma_px: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of focal length, cx and cy; 0: the file states none
 
@@ -52,11 +49,11 @@ _ITERATIONS = 50  # of undistortion
 def reduce_distortion(
     coefficients: Sequence[float], matrix: Float64[ndarray, "3 3"], size: tuple[int, int]
 ) -> tuple[tuple[float, float, float, float], float]:
-    """(k1, k2, p1, p2) nearest to OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), and the largest difference in pixels.
+    """(k1, k2, p1, p2) nearest to OpenCV's LENS_TERMS, and the largest difference in pixels.
 
     `matrix` holds focal lengths and principal point; `size` is (w, h). Four coefficients stay as they are.
     """
-    full = np.zeros(8)
+    full = np.zeros(len(LENS_TERMS))
     full[: len(coefficients)] = coefficients
     if not full[4:].any():
         return (full[0], full[1], full[2], full[3]), 0.0
@@ -73,7 +70,7 @@ def reduce_distortion(
 
 
 def _normalised_grid(
-    full: Float64[ndarray, "8"], matrix: Float64[ndarray, "3 3"], size: tuple[int, int]
+    full: Float64[ndarray, "12"], matrix: Float64[ndarray, "3 3"], size: tuple[int, int]
 ) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
     """Undistorted normalised coordinates of a grid of pixels, by fixed-point iteration."""
     u, v = np.meshgrid(np.linspace(0, size[0], _SAMPLES), np.linspace(0, size[1], _SAMPLES))
@@ -87,173 +84,65 @@ def _normalised_grid(
 
 
 def _distort(
-    x: Float64[ndarray, "n"], y: Float64[ndarray, "n"], full: Float64[ndarray, "8"]
+    x: Float64[ndarray, "n"], y: Float64[ndarray, "n"], full: Float64[ndarray, "12"]
 ) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
-    k1, k2, p1, p2, k3, k4, k5, k6 = full
+    k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4 = full
     r2 = x * x + y * y
     radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
-    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) + r2 * (s1 + r2 * s2)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y + r2 * (s3 + r2 * s4)
     return xd, yd
 
 
-# OpenCV's files, XML and YAML, read without OpenCV: its parser crashes on some damaged files.
-#
-# Both become the same tree of objects, lists and texts. Depth and size are limited.
-
-MAX_BYTES = 512 << 10  # a calibration with all of its image points is smaller
-MAX_DEPTH = 16
-_XML_ROOT = "opencv_storage"
-_ELEMENT_TYPE = re.compile(r"[1-9]?[ucswifdh]")  # channels, then the type of the numbers
-_NUMBER = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
-_NOT_FINITE = {".nan": np.nan, ".inf": np.inf, "+.inf": np.inf, "-.inf": -np.inf}
-
-
-class _NotAStorageError(UserError):
-    """Text that is no OpenCV file; the message says why."""
-
-
-def read_file_storage(path: Path) -> dict[str, Any]:
-    """The top level of an OpenCV file: matrices as arrays, numbers, texts, lists, objects. Raises FileError."""
-    content = read_bytes(path)
-    try:
-        if len(content) > MAX_BYTES:
-            raise _NotAStorageError(f"it has {len(content)} bytes, far more than a calibration")
-        tree = _xml_tree(content) if path.suffix.lower() == ".xml" else _yaml_tree(content)
-        if not isinstance(tree, dict):
-            raise _NotAStorageError("it holds no names with values")
-        return {str(key): _value(item) for key, item in tree.items()}
-    except (_NotAStorageError, ElementTree.ParseError, yaml.YAMLError, UnicodeError, ValueError) as error:
-        raise FileError(
-            path,
-            f"cannot be read as an OpenCV file ({first_line(error)})",
-            "it is damaged, or was written by another program (OpenCV's YAML starts with %YAML:1.0)",
-            "write it again with cv2.FileStorage, or give plain JSON",
-        ) from error
-
-
-def _xml_tree(content: bytes) -> Any:
-    if b"<!DOCTYPE" in content or b"\0" in content:  # zeros: UTF-16, in which a DOCTYPE would not be found
-        raise _NotAStorageError("it has a document type or is not UTF-8")
-    parser: Any = ElementTree.XMLPullParser(("start", "end"))
-    depth = 0
-    root: ElementTree.Element | None = None
-    for place in range(0, len(content), 4096):
-        parser.feed(content[place : place + 4096])
-        for event, element in parser.read_events():
-            depth += 1 if event == "start" else -1
-            root = element if root is None else root
-            if depth > MAX_DEPTH:
-                raise _NotAStorageError("it is nested too deeply")
-    parser.close()
-    if root is None or root.tag != _XML_ROOT:
-        raise _NotAStorageError(f"its first element is not {_XML_ROOT}")
-    return _xml_value(root)
-
-
-def _xml_value(element: ElementTree.Element) -> Any:
-    inner = list(element)
-    if not inner:
-        text = (element.text or "").strip()
-        words = text.split()
-        return words if len(words) > 1 and all(_number(word) is not None for word in words) else text.strip('"')
-    if all(child.tag == "_" for child in inner):
-        return [_xml_value(child) for child in inner]
-    if len({child.tag for child in inner}) != len(inner):
-        raise _NotAStorageError(f"a name occurs more than once in {element.tag}")
-    return {child.tag: _xml_value(child) for child in inner}
-
-
-def _yaml_tree(content: bytes) -> Any:
-    text = content.decode("utf-8-sig")
-    head, _, rest = text.partition("\n")
-    if not head.startswith("%YAML"):
-        raise _NotAStorageError("it does not start with %YAML")
-    loader = _StorageLoader(rest)
-    try:
-        return loader.get_single_data()
-    finally:
-        loader.dispose()
-
-
-class _StorageLoader(yaml.BaseLoader):
-    """YAML with texts for all numbers; tags such as !!opencv-matrix are not interpreted, aliases not allowed."""
-
-    _depth = 0
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise _NotAStorageError("it refers to an earlier part of itself")
-        self._depth += 1
-        if self._depth > MAX_DEPTH:
-            raise _NotAStorageError("it is nested too deeply")
-        node = super().compose_node(parent, index)
-        self._depth -= 1
-        return node
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        found = super().construct_mapping(node, deep)
-        if len(found) != len(node.value):
-            raise _NotAStorageError("a name occurs more than once")
-        return found
-
-
-def _value(item: Any) -> Any:
-    """A matrix as an array; everything else as it is, with numbers for texts that are numbers."""
-    if isinstance(item, dict):
-        return _matrix(item) if {"rows", "cols", "data"} <= set(item) else item
-    if isinstance(item, list):
-        return [_value(inner) for inner in item]
-    number = _number(item)
-    return item if number is None else number
-
-
-def _matrix(item: dict[Any, Any]) -> Float64[ndarray, "rows columns"]:
-    rows, columns = (_count(item[key]) for key in ("rows", "cols"))
-    kind = str(item.get("dt", "d")).strip('"')
-    if _ELEMENT_TYPE.fullmatch(kind) is None:
-        raise _NotAStorageError(f"dt is {kind[:20]!r}")
-    channels = int(kind[:-1] or 1)
-    data = item["data"] if isinstance(item["data"], list) else [item["data"]]
-    numbers = [None if isinstance(word, list | dict) else _number(word) for word in data if word != ""]
-    found = [number for number in numbers if number is not None]
-    if len(found) != len(numbers):
-        raise _NotAStorageError("a matrix holds something that is not a number")
-    if len(found) != rows * columns * channels:
-        raise _NotAStorageError(f"a matrix of {rows} x {columns} has {len(found)} numbers")
-    return np.array(found, dtype=np.float64).reshape(rows, columns * channels)
-
-
-def _count(word: Any) -> int:
-    if not isinstance(word, str) or not re.fullmatch("[0-9]{1,6}", word):
-        raise _NotAStorageError("the size of a matrix is not a whole number")
-    return int(word)
-
-
-def _number(word: str) -> float | None:
-    """The number that a text is, None if it is none."""
-    if word.lower() in _NOT_FINITE:
-        return _NOT_FINITE[word.lower()]
-    return float(word) if _NUMBER.fullmatch(word) else None
-
-
-# OpenCV's .yml, .yaml and .xml: the centre of the first pixel is (0, 0), so principal points get + 0.5.
+# Devices under the names of OpenCV and of other programs: the centre of the first pixel is (0, 0) there, so principal
+# points get + 0.5.
 
 _NAMED = 8  # names in a message
 FIRST_CENTRE = 0.5  # of a pixel, added to what OpenCV measured
+
+
+@dataclass(frozen=True)
+class StoredPair:
+    """The names under which a program stores a camera and a projector: matrix, lens, and sizes where it has them."""
+
+    camera: tuple[str, str]
+    projector: tuple[str, str]
+    camera_size: tuple[str, ...] = ()  # width and height, or one name of both
+    projector_size: tuple[str, ...] = ()
+    by_cell: bool = False  # procam-calibration: sizes are (rows, columns), the projector is measured at whole cells
+
+
+_PAIRS = (
+    StoredPair(("M1", "D1"), ("M2", "D2")),  # OpenCV's stereo_calib
+    StoredPair(("cameraMatrix1", "distCoeffs1"), ("cameraMatrix2", "distCoeffs2")),
+    StoredPair(("K1", "D1"), ("K2", "D2")),
+    StoredPair(("cam_K", "cam_kc"), ("proj_K", "proj_kc")),  # scan3d-capture (Moreno and Taubin), .yml
+    StoredPair(("K_left", "kc_left"), ("K_right", "kc_right")),  # the same, .m
+    StoredPair(("Kc", "kc"), ("Kp", "kp"), ("frameWidth", "frameHeight"), ("screenResX", "screenResY")),  # SLStudio
+    StoredPair(("cam_int", "cam_dist"), ("proj_int", "proj_dist"), ("img_shape",), by_cell=True),
+)
 _MATRIX = ("camera_matrix", "Camera_Matrix", "cameraMatrix", "K")
-_DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D")
-_SIZE = (("image_width", "image_height"), ("image_Width", "image_Height"))
-_PAIRS = (("M1", "D1", "M2", "D2"), ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2"))
+_DISTORTION = ("distortion_coefficients", "Distortion_Coefficients", "distCoeffs", "D", "kc")
+_SIZE = (("image_width", "image_height"), ("image_Width", "image_Height"), ("nx", "ny"))
 
 
-def opencv_entries(path: Path, stored: dict[str, Any]) -> list[DeviceEntry]:
-    """The camera of a calibration, or camera and projector of a stereo calibration. Raises FileError."""
-    for m1, d1, m2, d2 in _PAIRS:
+def stored_entries(path: Path, stored: dict[str, Any], step: int) -> list[DeviceEntry]:
+    """The camera of a calibration, or camera and projector of one. Raises FileError.
+
+    `step` is the graycode_step of procam-calibration.
+    """
+    for pair in _PAIRS:
+        (m1, d1), (m2, d2) = pair.camera, pair.projector
         if m1 in stored and m2 in stored:
+            # procam-calibration measured at `step * index of the cell`, its first pixel; its middle is further.
+            middle = FIRST_CENTRE + ((step - 1) / 2 if pair.by_cell else 0.0)
+            labels = (m1, m2) if pair.by_cell else ("camera", "projector")
+            camera, projector = (
+                _stored_size(path, stored, names, pair.by_cell) for names in (pair.camera_size, pair.projector_size)
+            )
             return [
-                opencv_entry(path, "camera", "camera", None, stored[m1], stored.get(d1), FIRST_CENTRE),
-                opencv_entry(path, "projector", "projector", None, stored[m2], stored.get(d2), FIRST_CENTRE),
+                opencv_entry(path, labels[0], "camera", camera, stored[m1], stored.get(d1)),
+                opencv_entry(path, labels[1], "projector", projector, stored[m2], stored.get(d2), middle),
             ]
     matrix = next((stored[key] for key in _MATRIX if key in stored), None)
     if matrix is None:
@@ -263,13 +152,32 @@ def opencv_entries(path: Path, stored: dict[str, Any]) -> list[DeviceEntry]:
             "this is no calibration, or one with other names",
             f"name the matrix {_MATRIX[0]} and the lens {_DISTORTION[0]}, as OpenCV's calibration program does",
         )
-    size = next((image_size(path, [stored[w], stored[h]]) for w, h in _SIZE if w in stored and h in stored), None)
+    size = next((size for names in _SIZE if (size := _stored_size(path, stored, names)) is not None), None)
     lens = next((stored[key] for key in _DISTORTION if key in stored), None)
-    return [opencv_entry(path, path.name, None, size, matrix, lens, FIRST_CENTRE)]
+    return [opencv_entry(path, path.name, None, size, matrix, lens)]
+
+
+def _stored_size(
+    path: Path, stored: dict[str, Any], names: Sequence[str], rows_first: bool = False
+) -> tuple[int, int] | None:
+    """The two numbers under the names; None where they are not stored, or 0, as SLStudio writes unknown sizes."""
+    if not names or any(name not in stored for name in names):
+        return None
+    numbers = stored[names[0]] if len(names) == 1 else [stored[name] for name in names]
+    if len(names) > 1 and all(number == 0 for number in numbers):
+        return None
+    first, second = image_size(path, numbers)
+    return (second, first) if rows_first else (first, second)
 
 
 def opencv_entry(
-    path: Path, label: str, role: Role | None, size: tuple[int, int] | None, matrix: Any, lens: Any, offset: float
+    path: Path,
+    label: str,
+    role: Role | None,
+    size: tuple[int, int] | None,
+    matrix: Any,
+    lens: Any,
+    offset: float = FIRST_CENTRE,
 ) -> DeviceEntry:
     """One device from its matrix and lens terms; `offset` is added to the principal point. Raises FileError."""
     K, k = _numbers(matrix), np.zeros(4) if lens is None else _numbers(lens)
@@ -279,16 +187,25 @@ def opencv_entry(
         raise FileError(
             path, f"{label}: the lens terms are not numbers", "a failed calibration, or a slip", "calibrate again"
         )
-    if k.size not in (4, 5, 8):
+    k = k.reshape(-1)
+    if k.size not in (4, 5, 8, 12, 14):
         raise FileError(
             path,
-            f"{label}: has {k.size} distortion coefficients",
-            "a fisheye, thin-prism or tilted model",
+            f"{label}: has {k.size} distortion coefficients, and OpenCV's models have 4, 5, 8, 12 or 14",
+            "another program's lens model, or a slip",
             "calibrate with OpenCV's standard model",
+        )
+    if k[12:].any():
+        raise FileError(
+            path,
+            f"{label}: the sensor is tilted (coefficients 13 and 14, tau x = {k[12]:.3g} and tau y = {k[13]:.3g}), "
+            "which a scan's lens model cannot express",
+            "calibrated with OpenCV's CALIB_TILTED_MODEL",
+            "calibrate without this flag, or undistort the images",
         )
     _require_camera_matrix(path, label, K)
     K[:2, 2] += offset
-    return DeviceEntry(label, role, size, K, tuple(k.reshape(-1).tolist()))
+    return DeviceEntry(label, role, size, K, tuple(k[: len(LENS_TERMS)].tolist()))
 
 
 def image_size(path: Path, stored: Any) -> tuple[int, int]:
@@ -410,34 +327,6 @@ def _at_least_zero(fields: Fields, key: str) -> float | None:
     return value
 
 
-# procam-calibration's calibration_result.xml, an OpenCV file: the centre of the first pixel is (0, 0).
-#
-# The projector was measured at the first pixel of each Gray-code cell, not at the middle of the cell.
-
-
-def is_procam(stored: dict[str, Any]) -> bool:
-    """Whether the content of an OpenCV file was written by procam-calibration."""
-    return "cam_int" in stored and "proj_int" in stored
-
-
-def procam_entries(path: Path, stored: dict[str, Any], step: int) -> list[DeviceEntry]:
-    """Camera and projector; `step` is the graycode_step of the calibration. Raises FileError.
-
-    `img_shape` is (rows, columns) of the camera; the file does not state the projector's size.
-    """
-    shape = stored.get("img_shape")
-    size = None
-    if shape is not None:
-        rows, columns = image_size(path, shape)
-        size = (columns, rows)
-    # Measured at `step * index of the cell`, its first pixel; its middle is (step - 1) / 2 further.
-    middle = (step - 1) / 2 + FIRST_CENTRE
-    return [
-        opencv_entry(path, "cam_int", "camera", size, stored["cam_int"], stored.get("cam_dist"), FIRST_CENTRE),
-        opencv_entry(path, "proj_int", "projector", None, stored["proj_int"], stored.get("proj_dist"), middle),
-    ]
-
-
 # COLMAP's cameras.txt: the centre of the first pixel is (0.5, 0.5), as in a scan.
 
 # COLMAP's models by their parameters; f stands for both focal lengths.
@@ -532,13 +421,13 @@ def read_entries(path: Path, procam_step: int = 1) -> list[DeviceEntry]:
         return read_json_entries(path)
     if suffix == ".txt":
         return read_colmap_entries(path)
-    if suffix in (".yml", ".yaml", ".xml"):
-        stored = read_file_storage(path)
-        return procam_entries(path, stored, procam_step) if is_procam(stored) else opencv_entries(path, stored)
+    if suffix in STORED:
+        return stored_entries(path, read_stored_values(path), procam_step)
     raise FileError(
         path,
         f"is of no known kind ({suffix or 'no ending'})",
-        "known are .json, OpenCV's .yml .yaml .xml, COLMAP's cameras.txt, procam-calibration's calibration_result.xml",
+        "known are .json, OpenCV's .yml .yaml .xml, COLMAP's cameras.txt, and the files of procam-calibration (.xml), "
+        "scan3d-capture (.yml .m), SLStudio (.xml .m .slcalib) and MATLAB's calibration toolbox (.m)",
         "convert it to one of these; docs/processing.md shows the plain JSON form",
     )
 
@@ -581,11 +470,15 @@ def _device(path: Path, entry: DeviceEntry, size: tuple[int, int]) -> Device:
         )
     (k1, k2, p1, p2), miss = reduce_distortion(entry.distortion, entry.matrix, size)
     if miss > LARGEST_MISS_PX:
+        beyond = {name: k for name, k in zip(LENS_TERMS[4:], entry.distortion[4:], strict=False) if k}
+        thin = any(name.startswith("s") for name in beyond)
         raise FileError(
             path,
-            f"{entry.label}: the lens model has terms beyond k1, k2, p1, p2, without which it is {miss:.2g} px off",
-            "calibrated with k3 or the rational model",
-            "calibrate with k1, k2, p1, p2 alone (OpenCV: CALIB_FIX_K3), or undistort the images",
+            f"{entry.label}: the lens model has terms beyond k1, k2, p1, p2 "
+            f"({', '.join(f'{name} = {k:.3g}' for name, k in beyond.items())}), without which it is {miss:.2g} px off",
+            "calibrated with k3 or the rational model" + (", and the thin-prism model" if thin else ""),
+            "calibrate with k1, k2, p1, p2 alone (OpenCV: CALIB_FIX_K3, without CALIB_RATIONAL_MODEL and "
+            "CALIB_THIN_PRISM_MODEL), or undistort the images",
         )
     K = entry.matrix
     fl_x, fl_y, cx, cy = float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])

@@ -120,7 +120,8 @@ def camera_from_exif(paths: Sequence[Path], size: tuple[int, int]) -> CameraStar
             paths[0],
             "does not say with which focal length it was taken, and no file gives the camera's intrinsics",
             "its EXIF data were removed by a program, or the camera writes none",
-            "give --intrinsics; sl-calibrate makes such a file from photographs of a board",
+            "give --intrinsics: sl-calibrate makes such a file from photographs of a board, of the camera alone with "
+            "--camera-only; the projector can be found from the captures, with --estimate-projector",
         )
     focal, sigma, source = found
     w, h = size

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import parse
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import track
+from sl_nerfstudio.console import command, next_steps, phase, say, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.layout import SequenceName
 
@@ -19,7 +18,7 @@ if TYPE_CHECKING:
     from sl_nerfstudio.decoding.decoder import Decoder
     from sl_nerfstudio.pattern.boards import Board
     from sl_nerfstudio.processing.captures import Captures
-    from sl_nerfstudio.review.verdict import Verdict
+    from sl_nerfstudio.review.verdict import Help, Verdict
 
 # The flags of sl-calibrate.
 
@@ -106,6 +105,16 @@ class CalibrateConfig:
             raise UserError(f"--{' --'.join(_FLAGS[self.board])}: {error}") from error
 
 
+_INPUTS = {
+    "images": "give the folder with the captures of the board",
+    "pattern": "give the pattern.json that sl-pattern wrote, or the projector's resolution, as 1024x768",
+}
+_GROUPS = {
+    "the board": ("board", "corners", "squares", "square", "marker", "dictionary"),
+    "the projector": ("pattern", "sequence", "projector_model", "camera_only"),
+}
+
+
 # What the flags of sl-calibrate name: photographs, the pattern on them, and the corners of the board.
 
 Size = tuple[int, int]
@@ -129,11 +138,12 @@ def read_inputs(config: CalibrateConfig, board: "Board") -> CalibrationInputs:
     from sl_nerfstudio.calibration.board_captures import BoardPhotographs, read_board_captures
     from sl_nerfstudio.pattern.gray_code import GrayCode
     from sl_nerfstudio.processing.captures import describe_sequence, incomplete
+    from sl_nerfstudio.processing.frames import capture_sentences
 
     found = _photographs(config)
     decoder = None if config.camera_only else _decoder(config, found)
     if decoder is not None and isinstance(decoder.layout, GrayCode):
-        print(describe_sequence(decoder.layout), flush=True)
+        say(describe_sequence(decoder.layout))
         found = found.with_faults(incomplete(found, decoder.layout))
     poses = [BoardPhotographs(frame.name, frame.images) for frame in found.frames if frame.name not in found.faults]
     captures = read_board_captures(poses, board, decoder, track)
@@ -146,18 +156,20 @@ def read_inputs(config: CalibrateConfig, board: "Board") -> CalibrationInputs:
             f"    remedy: capture 10 poses, tilted to all sides, near and far, all over the image\n{listed}".rstrip()
         )
     for fault in faults:
-        print(f"not used: {fault}", flush=True)
+        say(f"not used: {fault}")
+    for sentence in capture_sentences(captures.noted):
+        say(sentence)
     layout = None if decoder is None else decoder.layout
     return CalibrationInputs(captures, found.size, None if layout is None else (layout.w, layout.h))
 
 
 def _photographs(config: CalibrateConfig) -> "Captures":
     """Poses in sub-folders; for the camera alone, also single images."""
+    from sl_nerfstudio.calibration.board import FEWEST_VIEWS
     from sl_nerfstudio.processing.captures import find_captures
 
-    if config.camera_only and any(path.is_file() for path in _content(config)):
-        return find_captures(config.images, sequences=False)
-    return find_captures(config.images, sequences=True)
+    single = config.camera_only and any(path.is_file() for path in _content(config))
+    return find_captures(config.images, not single, needs=f"a calibration needs {FEWEST_VIEWS} poses at least")
 
 
 def _content(config: CalibrateConfig) -> list[Any]:
@@ -174,17 +186,21 @@ def _decoder(config: CalibrateConfig, found: "Captures") -> "Decoder[Any]":
 
     if config.pattern is None:
         layout = likely_layout(found, config.sequence or "opencv")
-        print(
-            f"projector: taken to have {layout.w} x {layout.h} pixels; if not, say so as --pattern 1024x768", flush=True
-        )
-        return choose_decoder(layout, None, config.images)
+        say(f"projector: taken to have {layout.w} x {layout.h} pixels; if not, say so as --pattern 1024x768")
+        return choose_decoder(layout, None, config.images, config.sequence is not None)
     size = resolution(config.pattern)
-    if size is not None:
-        return choose_decoder(recognise_sequence(found, size, config.sequence, None), None, config.pattern)
-    return choose_decoder(layout_in_order(config.pattern, config.sequence), None, config.pattern)
+    if size is None:
+        layout = layout_in_order(config.pattern, config.sequence)
+    else:
+        layout = recognise_sequence(found, size, config.sequence, None)
+    return choose_decoder(layout, None, config.pattern, config.sequence is not None)
 
 
 # What sl-calibrate says about its result.
+
+_HELP: "dict[Help, str]" = {
+    "boards": "add poses, tilted to all sides, near and far, and run the same sl-calibrate again"
+}
 
 
 def next_pose_words(found: "BoardCalibration") -> str:
@@ -219,23 +235,25 @@ def require_determined(found: "BoardCalibration") -> None:
 def calibrate_devices(config: CalibrateConfig) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     config.check()
-    board = config.the_board()
-    from sl_nerfstudio.calibration.board import MARK, calibrate, encode_calibration
-    from sl_nerfstudio.console import track
-    from sl_nerfstudio.evaluation.report.capture_reports import TITLE, render_calibration_report
-    from sl_nerfstudio.review.verdict import judge_calibration
-    from sl_nerfstudio.storage import held_results, write_atomic
+    with phase("start"):
+        board = config.the_board()
+        from sl_nerfstudio.calibration.board import MARK, calibrate, encode_calibration
+        from sl_nerfstudio.evaluation.report.capture_reports import TITLE, render_calibration_report
+        from sl_nerfstudio.review.verdict import judge_calibration
+        from sl_nerfstudio.storage import held_results, write_atomic
 
     report = config.output.with_suffix(".html")
     with held_results({config.output: MARK, report: TITLE}):
-        inputs = read_inputs(config, board)
-        found = calibrate(
-            inputs.captures.views, board, inputs.camera_size, inputs.pattern_size, config.projector_model, track
-        )
-        require_determined(found)
-        verdict = judge_calibration(found)
-        command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-        page = render_calibration_report(found, inputs.captures, verdict, next_pose_words(found), command)
+        with phase("read"):
+            inputs = read_inputs(config, board)
+        with phase("calibrate"):
+            found = calibrate(
+                inputs.captures.views, board, inputs.camera_size, inputs.pattern_size, config.projector_model, track
+            )
+            require_determined(found)
+        verdict = judge_calibration(found).with_help(_HELP)
+        called = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+        page = render_calibration_report(found, inputs.captures, verdict, next_pose_words(found), called)
         write_atomic(config.output, encode_calibration(found, verdict.band, verdict.reasons))
         write_atomic(report, page.encode())
     _print_summary(config, found, verdict, next_pose_words(found))
@@ -256,15 +274,14 @@ def _print_summary(config: CalibrateConfig, found: "BoardCalibration", verdict: 
         print(f"  {reason}")
     print(next_pose)
     print(f"wrote {config.output}\nreport: {config.output.with_suffix('.html')}")
+    pattern = config.pattern or "pattern.json"
+    flags = ("--images", "captures", "--pattern", pattern, "--intrinsics", config.output, "--output", "scan")
+    print(next_steps([command("sl-process", *flags, *(["--estimate-projector"] if config.camera_only else []))]))
 
 
 def main() -> None:
     """Entry point of the command."""
-    run(
-        lambda: calibrate_devices(
-            tyro.cli(CalibrateConfig, prog="sl-calibrate", config=(tyro.conf.FlagCreatePairsOff,))
-        )
-    )
+    run(lambda: calibrate_devices(parse(CalibrateConfig, "sl-calibrate", _INPUTS, _GROUPS)))
 
 
 if __name__ == "__main__":

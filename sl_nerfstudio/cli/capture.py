@@ -9,8 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import parse, require_paths
 from sl_nerfstudio.cli.run import Terminated, run
 from sl_nerfstudio.errors import UserError
 
@@ -86,6 +85,13 @@ class CaptureConfig:
         from sl_nerfstudio.pattern.boards import counts  # --help does not need it
 
         return None if self.size is None else counts(self.size, "--size")
+
+
+_GROUPS = {
+    "the pattern": ("pattern", "show", "settle"),
+    "the camera": ("size", "exposure", "focus", "rate"),
+    "this run": ("frames", "headless"),
+}
 
 
 # What sl-capture says about what it sees.
@@ -204,6 +210,10 @@ def say(text: str) -> None:
 def capture(config: CaptureConfig) -> None:
     """Capture until it is ended, then say what to do next. Raises UserError for what cannot be captured."""
     config.check()
+    if not config.camera.isdigit():
+        require_paths(
+            {"--camera": (Path(config.camera), "give the number of a camera (0 is the first), or a video file")}
+        )
     from sl_nerfstudio.capture.camera import open_camera
     from sl_nerfstudio.pattern.files import read_layout
     from sl_nerfstudio.pattern.gray_code import GrayCode
@@ -328,7 +338,11 @@ def _next_command(config: CaptureConfig) -> str:
 
 def main() -> None:
     """Entry point of the command."""
-    run(lambda: capture(tyro.cli(CaptureConfig, prog="sl-capture", config=(tyro.conf.FlagCreatePairsOff,))))
+    run(
+        lambda: capture(
+            parse(CaptureConfig, "sl-capture", {"pattern": "give the pattern.json that sl-pattern wrote"}, _GROUPS)
+        )
+    )
 
 
 if __name__ == "__main__":

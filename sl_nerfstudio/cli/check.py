@@ -1,18 +1,22 @@
 """`sl-check DIR`: every fault of a scan folder at once, or those of a training run."""
 
+import math
 import sys
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from sl_nerfstudio.cli.arguments import SCAN, parse, require_paths
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import unit_word
+from sl_nerfstudio.console import phase, unit_word
 
 if TYPE_CHECKING:
     from sl_nerfstudio.review.agreement import CrossFrameAgreement
+    from sl_nerfstudio.review.verdict import Help
     from sl_nerfstudio.runs.run import RunCheck
     from sl_nerfstudio.scan.check import FolderCheck
 
@@ -54,12 +58,8 @@ def run_summary(found: "RunCheck") -> str:
     )
 
 
-def main() -> None:
-    """Entry point of `sl-check`."""
-    run(lambda: tyro.cli(check, prog="sl-check"))
-
-
-def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]) -> None:
+@dataclass(frozen=True)
+class CheckArguments:
     """List every fault of a scan folder at once: file, frame, field, likely cause, what to do.
 
     Reads transforms.json and decodes every file; training makes the same check before it starts. Without faults it
@@ -68,45 +68,84 @@ def check(folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="D
 
     For a training run, checks without running anything from it: config.yml, the checkpoints, and whether they and the
     scan belong together.
-
-    Args:
-        folder: The scan folder, which holds transforms.json; or a run's folder or its config.yml.
     """
-    if is_run(folder):
-        sys.stdout.write(check_run_folder(folder))
-        return
+
+    folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
+    """the scan folder, which holds transforms.json; or a run's folder or its config.yml"""
+
+
+def main() -> None:
+    """Entry point of `sl-check`."""
+    run(lambda: check(parse(CheckArguments, "sl-check").folder))
+
+
+def check(folder: Path) -> None:
+    """Do what the command line asks for. Raises UserError with everything that is wrong."""
+    require_paths({"DIR": (folder, SCAN)})
+    with phase("check"):
+        said = check_run_folder(folder) if is_run(folder) else check_scan_folder(folder)
+    sys.stdout.write(said)
+
+
+def check_scan_folder(folder: Path) -> str:
+    """What the scan is, and how its frames agree. Raises ScanError with everything that is wrong."""
     from sl_nerfstudio.errors import ScanError
     from sl_nerfstudio.scan.check import check_folder
 
     result = check_folder(folder)
     if result.faults:
         raise ScanError(result.faults, str(folder))
-    from sl_nerfstudio.review.agreement import compare_scan_frames, shared_surface_of_scan
-
     scan, said = result.scan, ""
     if scan is not None:
-        cross = compare_scan_frames(scan, scan.poses, [frame.pose_sigma for frame in scan.frames])
-        said = agreement(result, cross, shared_surface_of_scan(scan).decoded)
-    sys.stdout.write(summary(result) + said)
+        with phase("comparing the frames"):
+            from sl_nerfstudio.review.agreement import compare_scan_frames, shared_surface_of_scan
+            from sl_nerfstudio.review.moving_part import moving_share
+
+            cross = compare_scan_frames(scan, scan.poses, [frame.pose_sigma for frame in scan.frames])
+            said = agreement(result, cross, shared_surface_of_scan(scan).decoded, moving_share(scan))
+    return summary(result) + said
 
 
-def agreement(result: "FolderCheck", cross: "CrossFrameAgreement", shared_decoded: Sequence[float | None]) -> str:
+_HELP: "dict[Help, str]" = {
+    "again": "leave it out of transforms.json, or capture it again and run sl-process",
+    "between": "capture views in between, and register all with sl-process",
+    "light": "capture it again with more light from the projector and less from the room",
+    "poses": "if the poses are only rough, state how much (sl_pose_sigma): ns-train sl-neus refines them; else "
+    "find them anew with sl-process",
+}
+
+
+def agreement(
+    result: "FolderCheck",
+    cross: "CrossFrameAgreement",
+    shared_decoded: Sequence[float | None],
+    moving: float | None = None,
+) -> str:
     """What the coordinates of the frames say about each other under the starting poses, and the verdict.
 
     `shared_decoded`: of the surface that others show, how much each frame decoded; None where not known.
+    `moving`: the share that moves before cameras in one place; None if nothing does.
     """
     from sl_nerfstudio.review.verdict import FrameFacts, ScanFacts, judge_scan
 
-    frames = tuple(
-        FrameFacts(content.name, decode_rate=content.decoded, shared_decoded=shared)
-        for content, shared in zip(result.contents, shared_decoded, strict=True)
-    )
-    verdict = judge_scan(ScanFacts(frames, cross=cross))
+    usable = [content.name for content in result.contents if content.correspondences is not None]
+    fit = result.fit
+    rays = {} if fit is None else dict(zip(usable, zip(fit.residual_px, fit.stated_px, strict=True), strict=True))
+    frames = []
+    for content, shared in zip(result.contents, shared_decoded, strict=True):
+        px, stated_px = rays.get(content.name, (math.nan, math.nan))
+        facts = FrameFacts(content.name, decode_rate=content.decoded, shared_decoded=shared)
+        known = not math.isnan(stated_px)
+        frames.append(replace(facts, rays_px=float(px), stated_px=float(stated_px)) if known else facts)
+    verdict = judge_scan(ScanFacts(tuple(frames), cross=cross, moving_share=moving)).with_help(_HELP)
     seen = [frame.seen for frame in cross.frames]
+    scan = result.scan
+    stated = scan is not None and any(frame.pose_sigma is not None for frame in scan.frames)
+    allowed = f"the noise of {cross.noise_px:.2g} px{' and the stated sl_pose_sigma' if stated else ''}"
     lines = [
         f"  coverage            {100 * min(seen):.0f} to {100 * max(seen):.0f} % of a frame's points seen by others",
-        f"  frames agree        to {cross.px_median:.2g} px (median), {cross.px_p95:.2g} px (95 %); "
-        f"noise {cross.noise_px:.2g} px",
+        f"  frames differ       by {cross.px_median:.2g} px (median), {cross.px_p95:.2g} px (95 %) under these poses;",
+        f"                      {cross.share:.0%} of that within what {allowed} allow{'' if stated else 's'}",
         f"  verdict             {verdict.band}",
         *(f"  warning             {reason}" for reason in verdict.reasons),
     ]

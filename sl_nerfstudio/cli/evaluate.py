@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from sl_nerfstudio.cli.arguments import SCAN, parse
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import figure, paragraph, unit_word
+from sl_nerfstudio.console import figure, paragraph, phase, unit_word
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -69,7 +70,9 @@ def _surface(evaluation: "Evaluation", sigma: "Sequence[PoseSigma | None]") -> s
     if not known:
         return "no truth is known, and the poses do not state their uncertainty"
     lengths, turns = [s.camera_translation for s in known], [s.camera_rotation_deg for s in known]
-    return f"no truth is known; cameras to {_rms(lengths):.2g} {evaluation.units}, {_rms(turns):.2g}° (1 sigma)"
+    return (
+        f"no truth is known; cameras to {_rms(lengths):.2g} {unit_word(evaluation.units)}, {_rms(turns):.2g}° (1 sigma)"
+    )
 
 
 def _worst_frame(evaluation: "Evaluation") -> str:
@@ -203,7 +206,7 @@ class EvalConfig:
     """Where to write the report, one HTML file that needs no network."""
     reference: Path | None = None
     """Compare with this instead of ground_truth/mesh.ply: a mesh, or points in an .npz file under the key `xyz`."""
-    f_distances: Annotated[tuple[float, ...], tyro.conf.arg(metavar="D [D ...]")] = ()
+    f_distances: Annotated[tuple[float, ...], tyro.conf.arg(metavar="D ..")] = ()
     """Distances for the F-score, in the scan's unit; default: four round ones from 0.1 % to 1 % of the truth's size."""
     distance: Annotated[tuple[str, ...], tyro.conf.arg(metavar='"P Q"')] = ()
     """Distances to measure, each between two points of the surface: "12.5,-3,40 10,2,38" (x,y,z in the unit and axes of
@@ -218,6 +221,19 @@ class EvalConfig:
     """Also print tables of all distances, pose errors and residuals."""
 
 
+_INPUTS = {
+    "mesh": "give the mesh that sl-export wrote",
+    "data": SCAN,
+    "poses": "give the transforms.json that sl-export --poses wrote",
+    "reference": "give a mesh, or an .npz file of points",
+    "distances": "give a text file with distances, one a line",
+}
+_GROUPS = {
+    "what is compared": ("poses", "reference", "distance", "distances", "f_distances"),
+    "what is written": ("json", "report", "verbose"),
+}
+
+
 def evaluate_scan(config: EvalConfig) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     _check(config)
@@ -230,24 +246,29 @@ def evaluate_scan(config: EvalConfig) -> None:
 
 
 def _evaluate(config: EvalConfig) -> None:
-    from sl_nerfstudio.evaluation.evaluate import evaluate, measure_lengths, read_inputs, typical_sigma
-    from sl_nerfstudio.evaluation.judgement import judge, to_json, trained_steps
-    from sl_nerfstudio.evaluation.report.scan_report import ResidualThumbnails, intrinsics_hint
-    from sl_nerfstudio.storage import write_atomic
+    with phase("read"):
+        from sl_nerfstudio.evaluation.evaluate import evaluate, measure_lengths, read_inputs, typical_sigma
+        from sl_nerfstudio.evaluation.judgement import further_commands, judge, to_json, trained_steps
+        from sl_nerfstudio.evaluation.report.scan_report import ResidualThumbnails, intrinsics_hint
+        from sl_nerfstudio.storage import write_atomic
 
-    pairs = _pairs(config)
-    inputs = read_inputs(config.mesh, config.data, config.poses, config.reference, config.samples, config.seed)
-    lengths = measure_lengths(pairs, inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
+        pairs = _pairs(config)
+        inputs = read_inputs(config.mesh, config.data, config.poses, config.reference, config.samples, config.seed)
     thumbnails = ResidualThumbnails()
-    evaluation = evaluate(
-        inputs.mesh, inputs.scan, inputs.poses, inputs.reference, inputs.true_poses, config.f_distances,
-        config.samples, config.seed, on_frame=thumbnails if config.report else None, sigma=inputs.stated_sigma,
-        true_units=inputs.true_units,
-    )  # fmt: skip
+    with phase("measure"):
+        lengths = measure_lengths(pairs, inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
+        evaluation = evaluate(
+            inputs.mesh, inputs.scan, inputs.poses, inputs.reference, inputs.true_poses, config.f_distances,
+            config.samples, config.seed, on_frame=thumbnails if config.report else None, sigma=inputs.stated_sigma,
+            true_units=inputs.true_units,
+        )  # fmt: skip
+        sigma = typical_sigma(inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
+    with phase("advise"):
+        capture = _next_capture(evaluation, inputs)
     hint, steps = intrinsics_hint(inputs.training, inputs.scan), trained_steps(inputs.training)
-    capture = _next_capture(evaluation, inputs)
-    sigma = typical_sigma(inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
-    judgement = judge(evaluation, hint, steps, capture, inputs.unplaced, sigma, inputs.departed)
+    judgement = judge(
+        evaluation, hint, steps, capture, inputs.unplaced, sigma, inputs.departed, further_commands(inputs.training)
+    )
     results: dict[Path, str] = {}
     if config.json:
         document = to_json(evaluation, judgement.verdict, capture, lengths)
@@ -314,7 +335,7 @@ def _check(config: EvalConfig) -> None:
 
 def main() -> None:
     """Entry point of `sl-eval`."""
-    run(lambda: evaluate_scan(tyro.cli(EvalConfig, prog="sl-eval")))
+    run(lambda: evaluate_scan(parse(EvalConfig, "sl-eval", _INPUTS, _GROUPS)))
 
 
 if __name__ == "__main__":

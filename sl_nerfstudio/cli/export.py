@@ -7,10 +7,9 @@ from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import CONFIG, SCAN, flag_name, parse
 from sl_nerfstudio.cli.run import load_run, run
-from sl_nerfstudio.console import command, fitted, next_steps, short_path, unit_word
+from sl_nerfstudio.console import command, fitted, next_steps, phase, short_path, unit_word
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ class ExportConfig:
             value = getattr(self, field.name)
             if field.default is not MISSING and value == field.default:
                 continue
-            words.append(f"--{field.name.replace('_', '-')}")
+            words.append(flag_name(field.name))
             if not isinstance(value, bool):
                 words += map(str, value if isinstance(value, tuple) else (value,))
         return words
@@ -109,6 +108,14 @@ class ExportConfig:
             cameras=self.cameras,
             trajectories=self.trajectory,
         )
+
+
+_GROUPS = {
+    "the surface": ("resolution", "object_only", "largest_component", "keep_unobserved", "fill_holes", "watertight"),
+    "for other programs": ("target_faces", "texture", "points", "cameras", "trajectory"),
+    "poses": ("poses",),
+    "files": ("data", "overwrite"),
+}
 
 
 # What is wrong with the flags of sl-export, found before anything slow; all of it at once.
@@ -200,10 +207,10 @@ def _places(config: ExportConfig) -> Iterator[str]:
     devices = [path for paths in config.settings("arbitrary").device_files.values() for path in paths]
     files = [*files_of(config.output, config.texture is not None), *others, *config.pose_files, *devices]
     absolute = [path.absolute() for path in files]
+    if config.points is not None and absolute.count(config.points.absolute()) > 1:
+        yield f"--points {config.points}: is another output of this command\n    remedy: choose another name"
+        files = [path for path in files if path.absolute() != config.points.absolute()]
     for path in files:
-        if absolute.count(path.absolute()) > 1 and path == config.points:
-            yield f"--points {path}: is another output of this command\n    remedy: choose another name"
-            continue
         try:
             yield from _place(path, config.overwrite)
         except OSError as error:
@@ -312,7 +319,7 @@ def _removed(surface: "ExtractedSurface") -> list[str]:
         for count, what in (
             (trimmed.unseen, "vertices that no frame saw"),
             (trimmed.contradicted, "that frames contradict"),
-            (trimmed.loose_pieces, "loose pieces"),
+            (trimmed.loose_pieces, "loose piece" if trimmed.loose_pieces == 1 else "loose pieces"),
         )
         if count
     ]
@@ -468,7 +475,7 @@ def _rms(values: "ndarray") -> float:
 
 def main() -> None:
     """Entry point of the command."""
-    run(lambda: export(tyro.cli(ExportConfig, prog="sl-export", config=(tyro.conf.FlagCreatePairsOff,))))
+    run(lambda: export(parse(ExportConfig, "sl-export", {"load_config": CONFIG, "data": SCAN}, _GROUPS)))
 
 
 def export(config: ExportConfig) -> None:
@@ -483,7 +490,11 @@ def export(config: ExportConfig) -> None:
         if config.pose_folder is not None:
             held.enter_context(locked(config.pose_folder))
         check_outputs(config)  # again: a process that held them until now may have written them
-        print(export_trained(load_run(config.load_config, config.data), config))
+        with phase("load"):
+            trained = load_run(config.load_config, config.data)
+        with phase("export"):
+            said = export_trained(trained, config)
+    print(said)
 
 
 def export_trained(trained: "TrainedRun", config: ExportConfig) -> str:

@@ -1,14 +1,13 @@
 """sl-pattern: write a pattern to project or to print, and its description."""
 
 import io
-import shlex
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import flag_name, parse
 from sl_nerfstudio.cli.run import run
+from sl_nerfstudio.console import command, next_steps, phase
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.layout import SequenceName
 
@@ -109,24 +108,23 @@ def write_board(arguments: "PatternArguments") -> str:
     return (
         f"wrote a {description(board)} to {output}\n"
         f"print board.pdf at 100 % ({paper}), and measure its ruler: if it is not 100 mm long, multiply all lengths "
-        f"below by what it is / 100 mm\nglue the print to something flat, capture it from many sides, then run\n"
-        f"    {calibrate_command(board)}"
+        f"below by what it is / 100 mm\nglue the print to something flat, and capture it from many sides under a "
+        f"pattern (sl-pattern --kind gray-code)\n{next_steps([calibrate_command(board)])}"
     )
 
 
-def calibrate_command(board: "Board") -> str:
+def calibrate_command(board: "Board", images: Path | str = "captures", pattern: Path | str = "pattern.json") -> str:
     """The command that calibrates with captures of the board."""
     from sl_nerfstudio.pattern.boards import Chessboard
 
+    size, square = f"{board.columns}x{board.rows}", f"{board.square:g} mm"
     if isinstance(board, Chessboard):
-        flags = ["--board", "chessboard", "--corners", f"{board.columns}x{board.rows}"]
-        last = []
+        flags = ["--board", "chessboard", "--corners", size, "--square", square]
     else:
-        flags = ["--board", "charuco", "--squares", f"{board.columns}x{board.rows}"]
-        last = ["--marker", f'"{board.marker:g} mm"', "--dictionary", shlex.quote(board.dictionary)]
-    lengths = ["--square", f'"{board.square:g} mm"', *last]
-    end = ["--pattern", "pattern.json", "--output", "intrinsics.json"]
-    return " ".join(["sl-calibrate", "--images", "captures", *flags, *lengths, *end])
+        marker = ["--marker", f"{board.marker:g} mm", "--dictionary", board.dictionary]
+        flags = ["--board", "charuco", "--squares", size, "--square", square, *marker]
+    end = ["--pattern", pattern, "--output", "intrinsics.json"]
+    return command("sl-calibrate", "--images", images, *flags, *end)
 
 
 def _board(arguments: "PatternArguments") -> "Board":
@@ -275,20 +273,51 @@ class PatternArguments:
         return self.shown_kind in ("chessboard", "charuco")
 
 
+_HELP_GROUPS = {
+    "patterns to project": (
+        "kind",
+        "preset",
+        "width",
+        "height",
+        "period",
+        "line_width",
+        "gap",
+        "seed",
+        "cell",
+        "sequence",
+    ),
+    "boards to print": ("corners", "squares", "square", "marker", "dictionary", "print_width"),
+    "on a display": ("show", "every"),
+}
+
+
 def main() -> None:
     """Entry point of the command."""
     run(_write)
 
 
 def _write() -> None:
-    arguments = tyro.cli(PatternArguments, prog="sl-pattern")
+    arguments = parse(PatternArguments, "sl-pattern", groups=_HELP_GROUPS)
     _check(arguments)
     if arguments.show is not None:
         _show(arguments, arguments.show)
-    elif arguments.is_board:
-        print(write_board(arguments))
-    else:
-        print(write_pattern(arguments.output, _layout(arguments), arguments.print_width))
+        return
+    with phase("draw"):
+        if arguments.is_board:
+            said = write_board(arguments)
+        else:
+            written = write_pattern(arguments.output, _layout(arguments), arguments.print_width)
+            said = f"{written}\n{_next(arguments)}"
+    print(said)
+
+
+def _next(arguments: PatternArguments) -> str:
+    """Say how to go on with a pattern that is projected."""
+    captured = ("sl-capture", "--camera", 0, "--output", "captures", "--pattern", arguments.output / "pattern.json")
+    if arguments.shown_kind == "gray-code":
+        return next_steps([command(*captured, "--show", 1)])
+    shown = [] if arguments.print_width else [command("sl-pattern", "--output", arguments.output, "--show", 1)]
+    return next_steps([*shown, command(*captured)])
 
 
 def _layout(arguments: PatternArguments, display: tuple[int, int] | None = None) -> "PatternLayout":
@@ -332,9 +361,9 @@ def _check(arguments: PatternArguments) -> None:
     fitting = ("output", "kind", *_FLAGS[kind], *(() if arguments.is_board else ("show", "every")))
     for field in fields(arguments):
         if field.name not in fitting and getattr(arguments, field.name) is not None:
-            own = ", ".join(_flag(name) for name in fitting[2:])
+            own = ", ".join(flag_name(name) for name in fitting[2:])
             raise UserError(
-                f"{_flag(field.name)}: has no meaning for --kind {kind}\n"
+                f"{flag_name(field.name)}: has no meaning for --kind {kind}\n"
                 f"    cause:  the flag belongs to another kind of pattern\n    remedy: leave it out; flags are {own}"
             )
     if arguments.every is not None and (arguments.show is None or not 0 < arguments.every < float("inf")):
@@ -343,10 +372,6 @@ def _check(arguments: PatternArguments) -> None:
         raise UserError(f"--seed {arguments.seed}: seeds are at least 0")
     if arguments.print_width is not None and not 0 < arguments.print_width < float("inf"):
         raise UserError(f"--print-width {arguments.print_width:g}: give a width in millimetres above 0")
-
-
-def _flag(name: str) -> str:
-    return "--" + name.replace("_", "-")
 
 
 if __name__ == "__main__":

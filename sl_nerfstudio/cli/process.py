@@ -3,14 +3,30 @@
 import sys
 from typing import TYPE_CHECKING
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import parse
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import command, next_steps
+from sl_nerfstudio.console import command, next_steps, phase, say
 from sl_nerfstudio.processing.config import ProcessConfig
 
 if TYPE_CHECKING:
     from sl_nerfstudio.processing.result import ProcessResult
+
+
+_INPUTS = {
+    "images": "give the folder with the captures",
+    "pattern": "give the pattern.json that sl-pattern wrote, or the projector's resolution, as 1024x768",
+    "intrinsics": "give the file with the intrinsics; sl-calibrate makes one",
+    "projector_intrinsics": "give the file with the intrinsics; sl-calibrate makes one",
+    "masks": "give the folder with one mask for each frame",
+    "poses": "give a transforms.json with rough poses",
+}
+_GROUPS = {
+    "devices": ("intrinsics", "projector_intrinsics", "projector_model", "procam_step", "rig", "estimate_projector"),
+    "captures": ("decoder", "sequence", "cell", "unordered", "not_mosaic"),
+    "lengths and poses": ("known_length", "poses", "no_adjust"),
+    "what is used of the pictures": ("masks", "object_only"),
+    "this run": ("work", "jobs", "seed"),
+}
 
 
 def main() -> None:
@@ -19,18 +35,14 @@ def main() -> None:
 
 
 def _process() -> None:
-    config = tyro.cli(ProcessConfig, prog="sl-process", config=(tyro.conf.FlagCreatePairsOff,))
+    config = parse(ProcessConfig, "sl-process", _INPUTS, _GROUPS)
     config.check()
-    from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
-    from sl_nerfstudio.processing.process import process
+    with phase("start"):
+        from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
+        from sl_nerfstudio.processing.process import process
 
-    result = process(config, render_processing_report, log)
+    result = process(config, render_processing_report, say)
     sys.stdout.write(closing_words(result))
-
-
-def log(text: str) -> None:
-    """Print a line of progress, at once even if the output is a file."""
-    print(text, flush=True)
 
 
 def closing_words(result: "ProcessResult") -> str:
@@ -40,15 +52,26 @@ def closing_words(result: "ProcessResult") -> str:
     output = result.config.output
     lost = [f"  left out: {f.name}: {first_line(f.reason)}\n" for f in result.frames if not f.in_scan]
     reasons = "".join(f"  {reason}\n" for reason in result.verdict.reasons)
-    scale = f"lengths in {result.units} ({result.scale_source})" if result.scale_source else "no length is known"
+    scale = f"lengths in {result.units} ({result.scale_source})"
+    if not result.scale_source:
+        scale = (
+            "no length is known: the same command with\n"
+            f"{command('--known-length', f'baseline of frame {_some_frame(result)} = 85 mm', indent='    ')}\n"
+            "    (as you measure it) adds one in seconds"
+        )
     return (
         f"verdict: {result.verdict.band}\n{reasons}"
         f"wrote {result.registered} of {len(result.frames)} frames to {output}, {scale}\n{''.join(lost)}"
         f"report: {output / 'processing.html'}\n"
-        f"decoded frames and poses are kept in {result.config.work_folder} for the next run; remove this folder once "
-        "you are happy with the scan\n"
+        f"decoded frames and poses are kept in {result.config.work_folder}: the same command with another length,\n"
+        "    other flags or another output takes them from there; remove this folder once you are happy with the scan\n"
         f"{next_steps([command('ns-train', 'sl-neus', '--data', output)])}\n"
     )
+
+
+def _some_frame(result: "ProcessResult") -> str:
+    """A frame of the scan, by its name."""
+    return next((frame.name for frame in result.frames if frame.in_scan), "0")
 
 
 if __name__ == "__main__":

@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import CONFIG, SCAN, parse
 from sl_nerfstudio.cli.run import load_run, run
-from sl_nerfstudio.console import command, next_steps
+from sl_nerfstudio.console import command, next_steps, phase
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -37,13 +36,17 @@ class RedecodeArguments:
 
 def main() -> None:
     """Entry point of the command."""
-    run(lambda: redecode(tyro.cli(RedecodeArguments, prog="sl-redecode")))
+    run(lambda: redecode(parse(RedecodeArguments, "sl-redecode", {"load_config": CONFIG, "data": SCAN})))
 
 
 def redecode(arguments: RedecodeArguments) -> None:
     """Do what the command line asks for. Raises UserError for anything a user can correct."""
     check(arguments)
-    print(redecode_trained(load_run(arguments.load_config, arguments.data), arguments))
+    with phase("load"):
+        trained = load_run(arguments.load_config, arguments.data)
+    with phase("decode"):
+        said = redecode_trained(trained, arguments)
+    print(said)
 
 
 def check(arguments: RedecodeArguments) -> None:

@@ -2,12 +2,10 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
 
-import tyro
-
+from sl_nerfstudio.cli.arguments import parse, require_paths
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import command, fitted, next_steps
+from sl_nerfstudio.console import command, fitted, next_steps, phase
 from sl_nerfstudio.synthesis.config import SynthConfig
 
 
@@ -20,7 +18,17 @@ class SynthArguments:
 
     output: Path
     """folder to write; it must be new or empty"""
-    config: Annotated[SynthConfig, tyro.conf.arg(name="")] = field(default_factory=SynthConfig)
+    config: SynthConfig = field(default_factory=SynthConfig)
+
+
+_GROUPS = {
+    "the scene": ("scene", "appearance", "background", "units"),
+    "the devices": ("path", "frames", "resolution", "pattern", "projector_model", "camera_distortion",
+                    "projector_distortion", "supersampling", "sensor_noise"),
+    "errors of coordinates and poses": ("noise", "missing", "wrong", "pose_error",
+                                                           "autocalibration_error", "clean"),
+    "what is written": ("images_only", "scale_known", "pose_sigma", "world_turn", "seed"),
+}  # fmt: skip
 
 
 def main() -> None:
@@ -29,19 +37,29 @@ def main() -> None:
 
 
 def _synthesise() -> None:
-    arguments = tyro.cli(SynthArguments, prog="sl-synth", config=(tyro.conf.OmitArgPrefixes,))
+    arguments = parse(SynthArguments, "sl-synth", groups=_GROUPS)
+    scene = Path(arguments.config.scene)
+    mesh = scene if scene.suffix else None
+    pattern = arguments.config.pattern, "give a pattern.json or an image"
+    require_paths({"--scene": (mesh, "give a mesh file, or the name of a scene (--help)"), "--pattern": pattern})
     arguments.config.check()
-    # slow to import: torch, open3d
-    from sl_nerfstudio.synthesis.boards import BOARDS, write_board_captures
-    from sl_nerfstudio.synthesis.synthesise import synthesise
+    with phase("render"):
+        # slow to import: torch, open3d
+        from sl_nerfstudio.synthesis.boards import BOARDS, write_board_captures
+        from sl_nerfstudio.synthesis.synthesise import synthesise
 
-    if arguments.config.scene in BOARDS:
-        write_board_captures(arguments.config, arguments.output)
-        print(f"wrote {arguments.config.frames} poses of a board to {arguments.output}")
-        return
-    synthesise(arguments.config, arguments.output)
-    print(f"wrote {arguments.config.frames} frames to {arguments.output}")
-    print(_next(arguments.output, arguments.config))
+        board = arguments.config.scene in BOARDS
+        (write_board_captures if board else synthesise)(arguments.config, arguments.output)
+    print(f"wrote {arguments.config.frames} {'poses of a board' if board else 'frames'} to {arguments.output}")
+    print(_next_of_board(arguments) if board else _next(arguments.output, arguments.config))
+
+
+def _next_of_board(arguments: SynthArguments) -> str:
+    from sl_nerfstudio.cli.pattern import calibrate_command
+    from sl_nerfstudio.synthesis.boards import BOARDS
+
+    images, pattern = arguments.output / "images", arguments.output / "pattern.json"
+    return next_steps([calibrate_command(BOARDS[arguments.config.scene], images, pattern)])
 
 
 def _next(output: Path, config: SynthConfig) -> str:

@@ -1,6 +1,7 @@
 """`sl-data`: a scan folder as nerfstudio's dataparser. Must not import datamanagers, trainer or methods."""
 
 import hashlib
+import shlex
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -349,7 +350,7 @@ def normalisation(scan: Scan, samples: PixelSamples) -> Similarity:
             f"{scan.root / 'transforms.json'}: only {len(points)} of {tried} pixels have a camera ray and a projector "
             "ray that meet in front of both devices. The poses are probably world-to-device instead of "
             "device-to-world, or in OpenCV axes (multiply them by diag(1, -1, -1, 1) from the right), or coords/ has "
-            "x and y swapped. Run sl-check on the folder."
+            "x and y swapped. sl-process finds poses and coordinates from the photographs."
         )
     centre, radius = enclosing_sphere(without_lonely(points))
     scale = OBJECT_RADIUS / radius
@@ -469,7 +470,16 @@ class SLDataParser(DataParser):
     @property
     def loaded(self) -> LoadedScan:
         """The scan, its pixels and its normalisation. Raises UserError for a folder that cannot be used."""
-        return load_scan(self.config.data, self.config.intrinsics_change)
+        root = scan_root(self.config.data)
+        if not (root / "transforms.json").is_file():
+            raise UserError(
+                f"{root}: has no transforms.json, so the scan is not there\n"
+                "    cause:  the scan of a run was moved, renamed or deleted after the training; ns-eval, ns-render "
+                "and ns-viewer look for it where config.yml says\n"
+                f"    remedy: put it back, or a link to it: ln -s NEW-PLACE {shlex.quote(str(root))}; sl-eval and "
+                "sl-export have --data for its new place"
+            )
+        return load_scan(root, self.config.intrinsics_change)
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: dict | None) -> DataparserOutputs:
         scan, S = self.loaded.scan, self.loaded.S_scene_world

@@ -27,6 +27,7 @@ class Decoded:
     mask: Bool[ndarray, "h w"]  # where the pattern lights the object; True at every decoded pixel
     pattern: Float32[ndarray, "h w"]  # in [0, 1]: captured intensity, locally normalised; 0 outside the mask
     light: Float32[ndarray, "h w"] | None = None  # that a pattern value of 1 adds, of full scale; NaN where unknown
+    notes: tuple[str, ...] = ()  # what is to be said about the capture, in words that are the same for similar captures
 
     @property
     def decoded(self) -> Bool[ndarray, "h w"]:
@@ -152,8 +153,9 @@ class Decoder(ABC, Generic[L]):
     reads: ClassVar[str]  # kind of the patterns it decodes
     sequence: ClassVar[bool]  # a frame is a folder of images, not a single image
 
-    def __init__(self, layout: L) -> None:
-        self.layout = layout
+    def __init__(self, layout: L, order_stated: bool = False) -> None:
+        """With `order_stated` the user named the order of the images: what speaks against it is a note, no error."""
+        self.layout, self.order_stated = layout, order_stated
 
     @abstractmethod
     def decode(self, paths: Sequence[Path]) -> Decoded:
@@ -165,7 +167,8 @@ class Decoder(ABC, Generic[L]):
     @property
     def key(self) -> str:
         """A text that changes whenever the decoder would give other results."""
-        digest = hashlib.sha256(f"{self.name} {self.version}".encode() + self.layout.encode())
+        stated = " stated" if self.order_stated else ""
+        digest = hashlib.sha256(f"{self.name} {self.version}{stated}".encode() + self.layout.encode())
         for path in self.weights():
             digest.update(path.read_bytes())
         return digest.hexdigest()

@@ -1,12 +1,13 @@
 """The decoders there are, and the choice of one for a pattern."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 from sl_nerfstudio.decoding.decoder import Decoded, Decoder
 from sl_nerfstudio.decoding.gray_code import check_count, check_sizes, decode_gray_code, take_samples
-from sl_nerfstudio.decoding.gray_code_order import check_order, order_fault
+from sl_nerfstudio.decoding.gray_code_order import check_order, order_fault, other_order
 from sl_nerfstudio.decoding.grid import NetworkDecoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.gray_code import GrayCode
@@ -20,7 +21,7 @@ class GrayCodeDecoder(Decoder[GrayCode]):
     """Decodes a folder of images: one photograph of every pattern of the sequence."""
 
     name: ClassVar[str] = "graycode"
-    version: ClassVar[int] = 3
+    version: ClassVar[int] = 4
     reads: ClassVar[str] = GrayCode.kind
     sequence: ClassVar[bool] = True
 
@@ -29,10 +30,17 @@ class GrayCodeDecoder(Decoder[GrayCode]):
         check_count(len(paths), self.layout)  # before reading them all
         images = [read_photograph(path) for path in paths]
         check_sizes(images)
-        fault = order_fault(check_order(take_samples(images), self.layout), self.layout, [path.name for path in paths])
-        if fault is not None:
+        samples = take_samples(images)
+        check = check_order(samples, self.layout)
+        other = None if check.fits else other_order(samples, self.layout)
+        fault = order_fault(check, self.layout, [path.name for path in paths], other)
+        if fault is None:
+            return decode_gray_code(images, self.layout)
+        if not self.order_stated or not check.misplaced or other is not None:
             raise fault
-        return decode_gray_code(images, self.layout)
+        decoded = decode_gray_code(images, self.layout)
+        note = f"{fault.problem}; decoded in the stated order all the same"
+        return replace(decoded, notes=(note, *decoded.notes))
 
 
 DECODERS: dict[str, type[Decoder[Any]]] = {
@@ -42,8 +50,8 @@ DECODERS: dict[str, type[Decoder[Any]]] = {
 """By name. The first one that reads a kind of pattern is the default for it."""
 
 
-def choose_decoder(layout: PatternLayout, name: str | None, path: Path) -> Decoder[Any]:
-    """The decoder called `name`, or by default the first one that reads the pattern.
+def choose_decoder(layout: PatternLayout, name: str | None, path: Path, order_stated: bool = False) -> Decoder[Any]:
+    """The decoder called `name`, or by default the first one that reads the pattern; `order_stated` as in `Decoder`.
 
     Raises UserError if there is no such decoder, or if it cannot decode the pattern in the file `path`.
     """
@@ -66,4 +74,4 @@ def choose_decoder(layout: PatternLayout, name: str | None, path: Path) -> Decod
             "    cause:  the pattern file is not the one that was projected, or the decoder is the wrong one\n"
             "    remedy: leave --decoder out, or give the pattern.json of what was projected"
         )
-    return chosen(layout)
+    return chosen(layout, order_stated)

@@ -5,7 +5,7 @@ uncertain; this is judged as in Xu and Aliaga, "Robust pixel classification for 
 (2007), from the direct and the global light of the finest stripes (Nayar et al. 2006).
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,18 +35,19 @@ _MISREAD = 1.0  # cells: a pixel whose own cell is farther than this from the pl
 
 @dataclass(frozen=True)
 class CodeCells:
-    """The cells of all pixels along one axis."""
+    """The cells of all pixels along one axis, as large as the finest stripes that are resolved."""
 
-    cell: Int32[ndarray, "h w"]  # index of the cell; its last `level` bits are uncertain
+    cell: Int32[ndarray, "h w"]  # number of the cell; its last `level` bits are uncertain
     level: Int8[ndarray, "h w"]  # number of the finest bits that are uncertain; -1: the cell is unknown
-    difference: Int16[ndarray, "bits h w"]  # image minus inverse of every bit, coarse to fine
+    difference: Int16[ndarray, "bits h w"]  # image minus inverse of every bit of the number, coarse to fine
+    size: int  # of a cell, in cells of the pattern
 
 
-def subcell_coordinates(cells: CodeCells, count: int) -> Float32[ndarray, "h w"]:
-    """Coordinate of every pixel in cells, of which there are `count`; NaN where it is unknown.
+def subcell_coordinates(cells: CodeCells) -> Float32[ndarray, "h w"]:
+    """Coordinate of every pixel in cells; NaN where it is unknown.
 
-    The first cell extends from 0 to 1. Where stripes are out of focus, the borders of coarser bits are used. Where
-    there are too few borders, the mean of the cells around a pixel is used instead.
+    The cell of number 0 extends from 0 to 1. Where stripes are out of focus, the borders of coarser bits are used.
+    Where there are too few borders, the mean of the cells around a pixel is used instead.
     """
     right, down = _borders(cells.cell, cells.level, cells.difference)
     pixels, borders = int((cells.level >= 0).sum()), int((right >= 0).sum() + (down >= 0).sum())
@@ -54,7 +55,7 @@ def subcell_coordinates(cells: CodeCells, count: int) -> Float32[ndarray, "h w"]
     half = int(np.clip(np.ceil(1.2 * pitch), _SMALLEST_WINDOW, _LARGEST_WINDOW))
     out = np.full(cells.cell.shape, np.nan, dtype=np.float32)
     _fit(cells.cell, cells.level, right, down, half, 2 * half / max(pitch, 0.5) + 2, out)
-    return np.clip(out, 0, count)
+    return out
 
 
 @compiled
@@ -345,9 +346,12 @@ def _border_bit(cells: CodeCells, first: Int32[ndarray, "h w"]) -> Float32[ndarr
 # Pixels that count as lit.
 _FINEST = 4  # bits of each axis that separate direct from global light; the finest alone may be out of focus
 _LEAST_DIRECT = 0.02  # of full scale: with less light, bits are lost in the noise
+SATURATED = 0.99  # of full scale
+OVEREXPOSED = 0.5  # of the lit pixels: where more are saturated, it is said
 _LEAST_SIGNAL = 4.0  # times the noise
 # Bits that count as certain.
 _UNCERTAIN = 0.08  # of the direct light: the smallest difference of an image and its inverse that decides a bit
+_RESOLVED = 0.15  # of the direct light, in the median of the lit pixels: a bit with less contrast is not resolved
 # Captures that are refused.
 _LEAST_LIT = 0.002  # of the image: with less, the pattern counts as not seen
 _LEAST_DECODED = 0.02  # of the lit pixels
@@ -364,6 +368,12 @@ class SequenceLight:
     ambient: Float32[ndarray, "h w"]  # global light: from the whole scene, not from the pixel's own ray
     signal: Float32[ndarray, "h w"]  # mean difference of the images from their inverse
     noise: float  # standard deviation of an image
+    brightest: Float32[ndarray, "h w"]  # in any of the finest images
+
+    @property
+    def saturated(self) -> float:
+        """Share of the lit pixels that are saturated in some image."""
+        return float((self.brightest[self.lit] > SATURATED).mean())
 
     @property
     def lit(self) -> Bool[ndarray, "h w"]:
@@ -384,14 +394,18 @@ def decode_gray_code(images: Sequence[Image], layout: GrayCode) -> Decoded:
     _check_light(images, layout, light)
     coords = np.full((*light.lit.shape, 2), np.nan, dtype=np.float32)
     stripes: list[Float32[ndarray, "h w"]] = []
+    finest: list[int] = []
     for axis in (0, 1):
-        coords[..., axis] = _coordinates(photographs, axis, light)
+        cells = _read_cells(photographs, axis, light) if layout.bit_images(axis) else None
+        finest.append(layout.cell * (1 if cells is None else cells.size))
+        coords[..., axis] = _coordinates(photographs, axis, light, cells)
         stripes.append(_stripe_image(photographs, axis, light))
     known = np.isfinite(coords).all(-1) & light.lit
     coords[~known] = np.nan
     coords = drop_small_regions(coords, _LARGEST_STEP * max(layout.cell, _usual_step(coords)), _LEAST_REGION)
     stripe = np.where(light.lit, (stripes[0] + stripes[1]) / 2, 0).astype(np.float32)
-    decoded = Decoded(coords, light.lit, stripe, np.where(light.lit, light.direct, np.float32(np.nan)))
+    notes = tuple(_notes(layout, light, finest))
+    decoded = Decoded(coords, light.lit, stripe, np.where(light.lit, light.direct, np.float32(np.nan)), notes)
     if decoded.rate < _LEAST_DECODED:
         raise DecodingError(
             f"only {decoded.rate:.1%} of the lit pixels could be decoded",
@@ -423,16 +437,36 @@ def separate(photographs: Photographs) -> SequenceLight:
             lowest = np.minimum(lowest, sine.mean - sine.amplitude)
     black = photographs.shown(ShownImage("black"))
     ambient = 2 * np.clip(lowest - (0 if black is None else black), 0, None)
-    return SequenceLight(highest - lowest, ambient, signal / np.float32(count), photographs.noise())
+    return SequenceLight(highest - lowest, ambient, signal / np.float32(count), photographs.noise(), highest)
 
 
-def _coordinates(photographs: Photographs, axis: int, light: SequenceLight) -> Float32[ndarray, "h w"]:
+def _notes(layout: GrayCode, light: SequenceLight, finest: Sequence[int]) -> Iterator[str]:
+    """What limits the coordinates: stripes that are too fine for what is seen of them, and saturated pixels."""
+    shown = [layout.cell << layout.bits[axis] - max(len(layout.bit_images(axis)), 1) for axis in (0, 1)]
+    if any(size > least for size, least in zip(finest, shown, strict=True)):
+        x, y = finest
+        yield (
+            f"decoded to {f'{x} px' if x == y else f'{x} px along x and {y} px along y'}: finer stripes have a "
+            f"contrast below {_RESOLVED:.0%} (out of focus, or too fine for the camera) and are not used"
+        )
+    if light.saturated > OVEREXPOSED:
+        yield (
+            f"overexposed: more than {OVEREXPOSED:.0%} of the lit pixels are saturated; with a shorter exposure "
+            "stripes have more contrast"
+        )
+
+
+def _coordinates(
+    photographs: Photographs, axis: int, light: SequenceLight, cells: CodeCells | None
+) -> Float32[ndarray, "h w"]:
     """Coordinates of all pixels along an axis, in pattern pixels."""
     layout = photographs.layout
-    cells = _read_cells(photographs, axis, light) if layout.bit_images(axis) else None
+    first, count = layout.first_code(axis), (layout.columns, layout.rows)[axis]
     if cells is not None and not layout.sines(axis):
-        return subcell_coordinates(cells, (layout.columns, layout.rows)[axis]) * layout.cell
-    coarse = None if cells is None else cell_places(cells) * np.float32(layout.cell)
+        return np.clip(subcell_coordinates(cells) * cells.size - first, 0, count) * layout.cell
+    if cells is not None and cells.size > 1:  # then the number of the period is not known
+        return np.full_like(light.direct, np.nan)
+    coarse = None if cells is None else (cell_places(cells) - first) * np.float32(layout.cell)
     found = phase_coordinates(photographs, axis, coarse, light.noise)
     size = (layout.w, layout.h)[axis]
     return np.where((found >= 0) & (found <= size), found, np.float32(np.nan))
@@ -480,17 +514,20 @@ def _read_cells(photographs: Photographs, axis: int, light: SequenceLight) -> Co
     """Cells of all pixels along an axis."""
     layout = photographs.layout
     places = layout.bit_images(axis)
-    bits = len(places)
     code = np.zeros(light.lit.shape, dtype=np.int32)
     uncertain = np.zeros_like(code)
-    differences = np.empty((bits, *code.shape), dtype=np.int16)
+    unresolved = 0  # of the finest bits
+    differences = np.empty((len(places), *code.shape), dtype=np.int16)
     for k, place in enumerate(places):
         p, q = photographs.pair(*place)
         difference = p - q
-        value = np.int32(1 << (bits - 1 - k))
-        code += value * (difference > 0)
-        uncertain += value * _uncertain(p, q, light)
+        contrast = np.abs(difference[light.lit]) / np.maximum(light.direct[light.lit], _LEAST_DIRECT)
+        unresolved = unresolved + 1 if np.median(contrast) < _RESOLVED else 0
+        code = 2 * code + (difference > 0)
+        uncertain = 2 * uncertain + _uncertain(p, q, light)
         differences[k] = np.rint(difference * 32767)
+    code, uncertain, bits = code >> unresolved, uncertain >> unresolved, max(len(places) - unresolved, 1)
+    size = 1 << layout.bits[axis] - bits
     cell = ungray(code, bits)
     level = np.full(code.shape, -1, dtype=np.int8)
     for coarser in reversed(range(LEVELS)):
@@ -498,8 +535,9 @@ def _read_cells(photographs: Photographs, axis: int, light: SequenceLight) -> Co
         c = cell >> coarser
         harmless = ((code >> coarser) ^ gray(c - 1)) | ((code >> coarser) ^ gray(c + 1))
         level[(uncertain >> coarser) & ~harmless == 0] = coarser
-    level[~light.lit | (cell >= (layout.columns, layout.rows)[axis])] = -1
-    return CodeCells(cell, level, differences)
+    beyond = cell * size - layout.first_code(axis)
+    level[~light.lit | (beyond + size <= 0) | (beyond >= (layout.columns, layout.rows)[axis])] = -1
+    return CodeCells(cell, level, differences[:bits], size)
 
 
 def _uncertain(p: Float32[ndarray, "h w"], q: Float32[ndarray, "h w"], light: SequenceLight) -> Bool[ndarray, "h w"]:

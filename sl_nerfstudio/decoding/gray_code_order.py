@@ -1,7 +1,7 @@
 """Which sequence a folder of photographs shows, where no pattern file says so."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
@@ -9,16 +9,17 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.decoding.decoder import DecodingError
-from sl_nerfstudio.decoding.gray_code import Image, Samples, check_sizes, take_samples
+from sl_nerfstudio.decoding.gray_code import OVEREXPOSED, SATURATED, Image, Samples, check_sizes, take_samples
 from sl_nerfstudio.pattern.gray_code import GrayCode, ungray
-from sl_nerfstudio.pattern.layout import HEAD, ORDERS, SequenceName
+from sl_nerfstudio.pattern.layout import HEAD, ORDERS, SequenceName, order_names
 
 # Whether photographs of a sequence show what they should: each image against its place in the sequence.
 #
 # This follows for any object: white is the brightest image of every pixel and black the darkest; an image and its
-# inverse add up to white and black; finer bits change more often from pixel to pixel than coarser ones; and where the
-# cell changes, it changes to one of its neighbours. The axes of the pattern turn as those of the camera do, because
-# projector and camera see the same side of a surface. All of it is measured at a few of the pixels.
+# inverse add up to white and black; and where a bit of a Gray code changes, the next finer bit is 1 and all others that
+# are finer are 0. That is measured where those bits are resolved: on the borders of coarse stripes lie the middles of
+# finer ones. The axes of the pattern turn as those of the camera do, because projector and camera see the same side of
+# a surface. All of it is measured at a few of the pixels.
 
 _LEAST_CONTRAST = 0.04  # of full scale, brightest less darkest image: a pixel that the projector lights
 _SHARE_OF_CONTRAST = 0.3  # of the usual contrast: darker pixels are left out
@@ -27,13 +28,12 @@ _NEAR = 0.2  # of the contrast: as bright as the brightest image, as dark as the
 _AGREE = 0.6  # of the lit samples: fewer contradict
 _CERTAIN = 0.3  # of the contrast: an image and its inverse that differ by less decide nothing
 _LEAST_CHANGES = 20  # neighbours that differ: with fewer, their order is not judged
-_LEAST_CERTAIN = 0.1  # of the lit samples: a bit of which fewer are certain is not judged
-_FEWER = 0.6  # a finer bit changes less often than this share of a coarser one
-_JUMPS = 0.4  # of the changes of cells: more of them lead to no neighbour
-_RESOLVED = 0.4  # of the neighbours: where more differ, cells are smaller than the camera's pixels
+_CONTINUES = 0.75  # of the borders of coarser bits: with fewer, a bit does not continue them
 _SINE = 0.2  # of the contrast: a sine's images differ from it by more
 _ONE_WAY, _SPREAD = 0.2, 0.4  # shares of changes along rows: far from one half, and much the same in all images
 _ORDER_SMOOTHING = 3.0  # samples
+_LEFT_OUT = 3  # of the finest resolved bits: pixels on their borders have a direction, too
+_INSIDE = 0.99  # of the certain samples: codes of cells of the pattern
 _TURNING = 0.9  # of the samples: axes that turn as the camera's
 
 Grid = Float32[ndarray, "n h w"]
@@ -58,6 +58,12 @@ class OrderCheck:
     misplaced: tuple[Misplaced, ...]
     turning: float | None  # share of samples where the pattern's axes turn as the camera's; None: cannot be judged
     judged: bool  # enough samples are lit
+    saturated: float = 0.0  # share of the lit samples that are saturated in their brightest image
+
+    @property
+    def overexposed(self) -> bool:
+        """Whether so much is saturated that images do not show their stripes."""
+        return self.saturated > OVEREXPOSED
 
     @property
     def fits(self) -> bool:
@@ -75,16 +81,15 @@ def check_order(samples: Samples, layout: GrayCode) -> OrderCheck:
     codes: list[tuple[Values, Lit]] = []
     for axis in (0, 1):
         if layout.bit_images(axis):
-            signs, certain = _bits(samples.lines, layout, axis)
-            misplaced += _not_finer(samples, signs, certain, axis, layout)
-            misplaced += _not_next(samples, signs, certain, axis, layout)
-            signs, certain = _bits(grid, layout, axis)
-            codes.append((_index(signs), np.logical_and.reduce(certain[: max(1, len(certain) - 3)])))
+            misplaced += _not_continued(samples, layout, axis)
+            signs, certain = _resolved_bits(grid, layout, axis)
+            codes.append((_index(signs), np.logical_and.reduce(certain[: max(1, len(certain) - _LEFT_OUT)])))
         else:
             codes.append((sine_phase(grid, layout, axis, 0), lit))
     unique = {item.place: item for item in reversed(misplaced)}
     turning = None if unique else _turning(*codes)
-    return OrderCheck(tuple(unique[place] for place in sorted(unique)), turning, True)
+    saturated = float((grid.max(0)[lit] > SATURATED).mean())
+    return OrderCheck(tuple(unique[place] for place in sorted(unique)), turning, True, saturated)
 
 
 def one_direction(samples: Samples) -> bool:
@@ -128,6 +133,39 @@ def _bits(
     return signs, certain
 
 
+def _resolved_bits(
+    images: Float32[ndarray, "n *at"], layout: GrayCode, axis: int
+) -> tuple[list[Bool[ndarray, "*at"]], list[Bool[ndarray, "*at"]]]:
+    """The same without the finest bits that are uncertain for half of the lit pixels or more; at least one bit."""
+    signs, certain = _bits(images, layout, axis)
+    lit = _lit(images).sum()
+    count = next((k for k, sure in enumerate(certain) if sure.sum() < lit / 2), len(certain))
+    return signs[: max(1, count)], certain[: max(1, count)]
+
+
+def with_numbering(layout: GrayCode, images: Sequence[Image]) -> GrayCode:
+    """The sequence with cells numbered from 0, or so that the middle has the middle of all codes.
+
+    Numbers from the middle are recognised by codes that no cell would have otherwise.
+    """
+    centred, grid = replace(layout, centred=True), take_samples(images).grid
+    if layout.centred or not centred.centred or _in_pattern(grid, layout) > _INSIDE:
+        return layout
+    return centred if _in_pattern(grid, centred) > _INSIDE else layout
+
+
+def _in_pattern(grid: Grid, layout: GrayCode) -> float:
+    """Share of the samples with certain bits whose codes are those of cells of the pattern, along the worse axis."""
+    shares = []
+    for axis, count in enumerate((layout.columns, layout.rows)):
+        if layout.bit_images(axis):
+            signs, certain = _resolved_bits(grid, layout, axis)
+            block = 1 << (layout.bits[axis] - len(signs))
+            place = (_index(signs) * block - layout.first_code(axis))[np.logical_and.reduce(certain)]
+            shares.append(float(((place + block > 0) & (place < count)).mean()) if place.size else 1.0)
+    return min(shares, default=1.0)
+
+
 def _heads(grid: Grid, layout: GrayCode, lit: Lit) -> list[Misplaced]:
     highest, lowest = grid.max(0), grid.min(0)
     slack = _NEAR * (highest - lowest)
@@ -150,7 +188,8 @@ def _not_inverse(grid: Grid, layout: GrayCode, lit: Lit) -> list[Misplaced]:
         if inverse is None:
             continue
         apart = np.abs(grid[direct] + grid[inverse] - highest - lowest) > 2 * _NEAR * (highest - lowest)
-        if apart[lit].mean() > 1 - _AGREE:
+        judged = lit & (np.maximum(grid[direct], grid[inverse]) < SATURATED)
+        if judged.sum() >= _LEAST_LIT and apart[judged].mean() > 1 - _AGREE:
             seen = "and its neighbour are not each other's inverse"
             found += [Misplaced(place, str(layout.shown[place]), seen) for place in (direct, inverse)]
     return found
@@ -183,43 +222,18 @@ def sine_phase(grid: Grid, layout: GrayCode, axis: int, which: int) -> Float64[n
     return np.angle(np.tensordot(turns, grid[places], 1)) % (2 * np.pi)
 
 
-def _not_finer(
-    samples: Samples, signs: Sequence[OnLines], certain: Sequence[OnLines], axis: int, layout: GrayCode
-) -> list[Misplaced]:
-    """Bits that change less often than a coarser one.
-
-    Between two borders of a coarser bit lie borders of every finer one. A line with a single border may lie in a part
-    of the pattern without any of the next bit, so one border of each line does not count.
-    """
-    found: list[Misplaced] = []
-    most, at = 0.0, -1
-    for sign, sure, (place, _) in zip(signs, certain, layout.bit_images(axis), strict=True):
-        here, there = samples.neighbours(sure)
-        if sure.mean() < _LEAST_CERTAIN * np.mean(certain[0]) or not len(here):
-            continue
-        changed = sign[here] != sign[there]
-        between = np.maximum(np.bincount(samples.line[here][changed], minlength=1) - 1, 0).sum() / len(here)
-        if changed.mean() < _FEWER * most and most * len(here) >= _LEAST_CHANGES:
-            seen = "changes more or less often than its place in the order allows"
-            found += [Misplaced(k, str(layout.shown[k]), seen) for k in (at, place)]
-        elif between > most:
-            most, at = float(between), place
-    return found
-
-
-def _not_next(
-    samples: Samples, signs: Sequence[OnLines], certain: Sequence[OnLines], axis: int, layout: GrayCode
-) -> list[Misplaced]:
-    """The first bit with which cells change to others than their neighbours."""
-    for count in range(2, len(signs) + 1):
-        index = _index(signs[:count])
-        here, there = samples.neighbours(np.logical_and.reduce(certain[:count]))
-        step = np.abs(index[here] - index[there])
-        changes = int((step > 0).sum())
-        if changes > _RESOLVED * len(step):
-            return []
-        if changes >= _LEAST_CHANGES and (step > 1).sum() > _JUMPS * changes:
-            place = layout.bit_images(axis)[count - 1][0]
+def _not_continued(samples: Samples, layout: GrayCode, axis: int) -> list[Misplaced]:
+    """The first bit of an axis that is not what the borders of the coarser bits say of it."""
+    signs, certain = map(np.array, _bits(samples.lines, layout, axis))
+    here = np.flatnonzero(_lit(samples.lines)[:-1] & (np.diff(samples.line) == 0))
+    here = here[_lit(samples.lines)[here + 1]]
+    changed = signs[:, here] != signs[:, here + 1]
+    sure = certain[:, here] & certain[:, here + 1] & ~changed
+    for bit in range(1, len(signs)):
+        border = (changed[:bit].sum(0) == 1) & (sure[:bit] | changed[:bit]).all(0) & sure[bit]
+        expected = changed[bit - 1, border]
+        if len(expected) >= _LEAST_CHANGES and (signs[bit, here[border]] == expected).mean() < _CONTINUES:
+            place = layout.bit_images(axis)[bit][0]
             return [Misplaced(place, str(layout.shown[place]), "does not continue the coarser bits")]
     return []
 
@@ -286,7 +300,7 @@ def layout_of_images(
     checks = [(layout, check_order(samples, layout)) for layout in _with_periods(possible, samples)]
     fitting = [layout for layout, check in checks if check.fits]
     if len(fitting) == 1:
-        return fitting[0]
+        return with_numbering(fitting[0], images)
     if not fitting:
         raise _ONE_DIRECTION if one_direction(samples) else _nothing_fits(checks)
     kinds = " or ".join([*map(_described, fitting[:3]), *(["others"] if len(fitting) > 3 else [])])
@@ -360,23 +374,44 @@ def _nothing_fits(checks: Sequence[tuple[GrayCode, OrderCheck]]) -> DecodingErro
     layout, nearest = min(checks, key=lambda item: len(item[1].misplaced))
     if nearest.misplaced:
         names = [f"image {place}" for place in range(layout.images)]
-        return DecodingError(
+        error = DecodingError(
             f"shows no known sequence; nearest is {_described(layout)}, but counted from 0 {_listed(nearest, names)}",
             "images are in the wrong order or of another frame, or something moved in between",
             "put the images in the order of projection, or give a pattern.json that lists what each image shows",
         )
+        return _with_exposure(error, nearest)
     return _mirrored(layout)
 
 
-def order_fault(check: OrderCheck, layout: GrayCode, names: Sequence[str]) -> DecodingError | None:
-    """The error of photographs called `names` that do not show the sequence; None where nothing contradicts it."""
-    if check.misplaced:
+def other_order(samples: Samples, layout: GrayCode) -> GrayCode | None:
+    """The sequence of another program, for the same projector and cells, that photographs show; None if they do not."""
+    names: Sequence[SequenceName] = tuple(ORDERS)  # pyright: ignore[reportAssignmentType]
+    orders = {GrayCode.in_order(name, layout.w, layout.h, layout.cell) for name in names}
+    others = (other for other in orders if other.images == layout.images and other.shown != layout.shown)
+    return next((other for other in others if check_order(samples, other).fits), None)
+
+
+def order_fault(
+    check: OrderCheck, layout: GrayCode, names: Sequence[str], other: GrayCode | None
+) -> DecodingError | None:
+    """The error of photographs called `names` that do not show the sequence; None where nothing contradicts it.
+
+    `other` is the sequence that they show instead, if there is one.
+    """
+    if other is not None:
         return DecodingError(
+            f"shows the images in the order of {other.order}, not of {layout.order}",
+            "the sequence is that of another program than the one stated",
+            f"give --sequence {order_names(other.shown, other.scope)[0]}",
+        )
+    if check.misplaced:
+        error = DecodingError(
             f"is not in the order of the sequence ({layout.order}): {_listed(check, names)}",
             "images are exchanged, doubled or of another frame, the sequence is that of another program, or something "
             "moved in between",
             "name the images so that sorting puts them in the order of projection; --sequence selects another order",
         )
+        return _with_exposure(error, check)
     return _mirrored(layout) if check.turning is not None and check.turning < _MIRRORED else None
 
 
@@ -386,11 +421,24 @@ def _listed(check: OrderCheck, names: Sequence[str]) -> str:
     return "; ".join(found) + (f"; and {more} more" if more > 0 else "")
 
 
+def _with_exposure(error: DecodingError, check: OrderCheck) -> DecodingError:
+    """The error of images in a wrong order, or of images that are too bright to show their stripes."""
+    if not check.overexposed:
+        return error
+    return DecodingError(
+        f"is overexposed ({check.saturated:.0%} of the lit pixels are saturated), and {error.problem}",
+        f"the exposure was too long for images to show their stripes; otherwise, {error.cause}",
+        f"capture again with a shorter exposure, white below full scale; otherwise, {error.remedy}",
+    )
+
+
 def _mirrored(layout: GrayCode) -> DecodingError:
     return DecodingError(
         f"shows {_described(layout)} as in a mirror",
-        "rows and columns, or an image and its inverse, are exchanged, or the images are mirrored",
-        "give the images as the camera took them, and a pattern.json that lists what each image shows",
+        "the projector is set to rear projection, the camera's program mirrors its photographs, or rows and columns "
+        "are exchanged",
+        "switch the projector from rear to front projection, and the camera's mirroring off; or give a pattern.json "
+        "that lists what each image shows",
     )
 
 

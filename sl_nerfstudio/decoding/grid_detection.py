@@ -433,7 +433,7 @@ def _misfit(found: DetectedGrid, detector: GridDetector) -> list[Cause]:
     """A grid that was read, and is not that of the pattern as it is."""
     if detector.assign(mirrored(found.graph)).known.sum() >= LEAST_NODES:
         words = "the image is mirrored: its mirror image fits the pattern"
-        return [Cause(words, "turn mirroring off in the camera or the projector")]
+        return [Cause(words, "switch the projector from rear to front projection, or the camera's mirroring off")]
     if shows_readable_symbols(found.graph):
         words = "it shows another pattern: the symbols of its grid can be read, and fit this pattern nowhere"
         return [Cause(words, "give the pattern.json of the pattern that was projected")]

@@ -20,6 +20,7 @@ from sl_nerfstudio.evaluation.agreement import (
     compare_captures,
 )
 from sl_nerfstudio.evaluation.completeness import Completeness, assess_completeness
+from sl_nerfstudio.evaluation.mesh_faults import MeshFault, find_mesh_faults, missed_axes
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import (
     PointReference,
@@ -275,6 +276,7 @@ class Evaluation:
     starting_poses: bool  # the scan's own poses were evaluated, not refined ones
     cross: CrossFrameAgreement | None = None  # of the frames with each other, under the evaluated poses
     completeness: Completeness | None = None
+    mesh_faults: tuple[MeshFault, ...] = ()
     true_units: str | None = None  # what the truth's files say
 
     @property
@@ -337,6 +339,7 @@ def evaluate(
         starting_poses=not moved,
         cross=compare_scan_frames(scan, poses, sigma or [None] * len(scan.frames)),
         completeness=assess_completeness(surface, agreement),
+        mesh_faults=find_mesh_faults(surface, scan, poses),
         true_units=true_units,
     )
 
@@ -388,11 +391,12 @@ def _starts(
 def _missed(surface: IndexedMesh, scan: Scan, poses: DevicePoses) -> str:
     """Why no ray hits the mesh, as far as sizes and distances show."""
     distance = float(np.median(np.linalg.norm(poses.T_world_camera[:, :3, 3] - surface.centre, axis=1)))
+    axes = missed_axes(surface, scan, poses)
+    probably = axes or "probably another unit, other axes or another scan"
     return (
         "no camera ray through a masked pixel hits the mesh\n"
         f"    cause:  mesh and poses do not match: the mesh measures {surface.diagonal:.4g}, and the cameras are "
-        f"{distance:.4g} away from it (median; the scan's unit is {scan.units}); probably another unit, other axes or "
-        "another scan\n"
+        f"{distance:.4g} away from it (median; the scan's unit is {scan.units}); {probably}\n"
         "    remedy: give the mesh that was exported from this scan, in its unit and world axes"
     )
 

@@ -1,8 +1,9 @@
 """How the figures of an evaluation are judged, what that makes of the verdict, and what to do next."""
 
 import math
+import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from sl_nerfstudio.console import figure, unit_word
@@ -13,6 +14,7 @@ from sl_nerfstudio.evaluation.reference import DeviceErrors, MeshReference, Pose
 from sl_nerfstudio.review.verdict import (
     Band,
     DepartedFrame,
+    Help,
     Reason,
     Verdict,
     cross_reasons,
@@ -59,24 +61,79 @@ def judged(
 # How completeness is judged: by shares of what was observed, and of the surface.
 
 
-def completeness_figures(found: Completeness, units: str) -> list[JudgedFigure]:
-    """What is missing of the observed surface is a fault; what nobody observed is at most a weakness."""
+def holes_figure(found: Completeness, units: str) -> JudgedFigure:
+    """What nobody observed is at most a weakness."""
     o, unit = found.openings, unit_word(units)
     size = f"{len(o)}, {figure(o.area.sum())} {unit}² in all, borders {figure(o.length.sum())} {unit} long"
-    return [
-        judged(
-            "Observed surface", 100 * found.observed, "{:.1f} % present", 99.0, 96.0, "≥ {} %",
-            "Share of the decoded pixels of all frames at which the mesh has a surface near the measured point.",
-            "surface is missing where it was measured: train longer, or export with a finer resolution",
-        ),
-        judged(
-            "Holes", 100 * found.hole_share, f"{{:.1f}} % of the surface beside the rim (openings: {size})", 5.0,
-            float("inf"), "≤ {} %",
-            "Area of all places where the mesh ends, except for the largest one, the rim of the scan, as a share of "
-            "the surface. Objects are closed: behind each of them is surface that no frame saw.",
-            "capture what no frame saw, or export with --keep-unobserved, which invents it",
-        ),
+    return judged(
+        "Holes", 100 * found.hole_share, f"{{:.1f}} % of the surface beside the rim (openings: {size})", 5.0,
+        float("inf"), "≤ {} %",
+        "Area of all places where the mesh ends, except for the largest one, the rim of the scan, as a share of "
+        "the surface. Objects are closed: behind each of them is surface that no frame saw.",
+        "capture what no frame saw; sl-export --fill-holes MM closes small ones",
+    )  # fmt: skip
+
+
+def coverage_figure(evaluation: Evaluation, commands: "FurtherCommands") -> JudgedFigure:
+    """How much of what the frames observed the mesh has: over all, in the frame that lacks most, and in one place."""
+    fit, found = evaluation.agreement, evaluation.completeness
+    covered = min(fit.frames, key=lambda f: f.covered_share if math.isfinite(f.covered_share) else 1.0)
+    hole = max(fit.frames, key=lambda f: f.largest_hole if math.isfinite(f.largest_hole) else 0.0)
+    parts = [
+        judged("", 100 * fit.hit_share, "{:.1f} % of the pixels with pattern", 97.0, 85.0, "≥ {} %", "", ""),
+        judged("", 100 * (math.nan if found is None else found.observed), "{:.1f} % of what the frames decoded",
+               99.0, 96.0, "≥ {} %", "", ""),
+        judged("", 100 * covered.covered_share, f"{{:.0f}} % of what {covered.name} decoded", 90.0, 75.0, "≥ {} %",
+               "", ""),
+        judged("", 100 * hole.largest_hole, f"largest gap {{:.1f}} % of {hole.name}", 0.5, 2.0, "≤ {} %", "", ""),
     ]  # fmt: skip
+    known = [part for part in parts if part.band != "unknown"]
+    worst_part = max(known, key=lambda part: _ORDER[part.band], default=parts[0])
+    return replace(
+        worst_part,
+        name="Coverage",
+        text=", ".join(part.text for part in known) or "none",
+        good=", ".join(part.good for part in known),
+        acceptable=", ".join(part.acceptable for part in known),
+        meaning="Share of the pixels with pattern at which the mesh has a surface; of the decoded ones, near the "
+        "measured point; the same in the frame that lacks most; and the largest connected area without a surface, in "
+        "percent of its frame's decoded pixels. Gaps along the rim do not count for the last.",
+        advice=f"surface is missing where it was measured: {commands.for_missing_surface}",
+    )
+
+
+# Commands that go on from what was evaluated, as far as they are known.
+
+
+@dataclass(frozen=True)
+class FurtherCommands:
+    """Commands for the run that the mesh was exported from; "" where there is nothing to gain or nothing is known."""
+
+    train: str = ""  # up to its last step
+    export: str = "sl-export --load-config CONFIG --output MESH --resolution 1024"  # with finer cells
+
+    @property
+    def for_missing_surface(self) -> str:
+        """What brings back surface that frames observed."""
+        return f"train to the end: {self.train}" if self.train else f"export with finer cells: {self.export}"
+
+    @property
+    def for_disagreement(self) -> str:
+        """What brings surface and captures together."""
+        again = "train with --pipeline.model.refine-poses free, or decode again with sl-redecode --load-config CONFIG"
+        return f"train to the end: {self.train}" if self.train else again
+
+
+def further_commands(training: dict[str, Any] | None) -> FurtherCommands:
+    """Read the commands that sl-export wrote to training.json; those that are usual where there are none."""
+    found, steps = (training or {}).get("commands"), trained_steps(training)
+    if not isinstance(found, dict):
+        return FurtherCommands()
+    train, export = (
+        shlex.join(map(str, words)) if isinstance(words := found.get(key), list) else "" for key in ("train", "export")
+    )
+    complete = steps is not None and steps.done >= steps.wanted
+    return FurtherCommands("" if complete else train, export or FurtherCommands.export)
 
 
 # How long a surface was trained, against what is recommended.
@@ -107,12 +164,12 @@ def trained_steps(training: dict[str, Any] | None) -> TrainedSteps | None:
     return TrainedSteps(step + 1, max(known))
 
 
-def training_figure(steps: TrainedSteps) -> JudgedFigure:
+def training_figure(steps: TrainedSteps, commands: FurtherCommands) -> JudgedFigure:
     """Below a tenth of the steps a surface has not formed; in between it may be good, but the other figures decide."""
     return judged(
         "Training", 100 * steps.share, f"{{:.0f}} % ({steps.done} of {steps.wanted} steps)", 100.0, 10.0, "≥ {} %",
         "Steps of the training, compared with those that are recommended for the method, or with the run's own length.",
-        "train to the end, or with the recommended number of steps",
+        f"train to the end: {commands.train or 'ns-train METHOD --data SCAN --load-dir RUN/nerfstudio_models'}",
     )  # fmt: skip
 
 
@@ -175,6 +232,14 @@ ALIGNED = {"rigid": "rigid alignment", "similarity": "alignment with scale"}
 _ORDER: dict[str, int] = {"good": 0, "unknown": 1, "acceptable": 1, "poor": 2}
 
 
+HELP: dict[Help, str] = {
+    "again": "leave it out of transforms.json and train again, or capture it again",
+    "between": "capture views in between, and register all with sl-process",
+    "poses": "train with --pipeline.model.refine-poses free, and evaluate the refined poses (--poses)",
+}
+"""What helps against what the frames say of each other, once there is a surface."""
+
+
 @dataclass(frozen=True)
 class Judgement:
     """The verdict, which is the worst judgement, and all judged figures."""
@@ -187,9 +252,8 @@ class Judgement:
 
     @property
     def next_steps(self) -> list[str]:
-        """What to do, most urgent first; empty for a good scan that no further capture would complete."""
-        bad = sorted((c for c in self.figures if _ORDER[c.band]), key=lambda c: -_ORDER[c.band])
-        return [*self.hints, *(f"{c.name}: {c.advice}" for c in bad), *filter(None, [self.capture])]
+        """What to do besides what each reason says; empty for a good scan that no further capture would complete."""
+        return [*self.hints, *filter(None, [self.capture])]
 
 
 def judge(
@@ -200,13 +264,14 @@ def judge(
     unplaced: Sequence[str] = (),
     length_sigma: float | None = None,
     departed: Sequence[DepartedFrame] = (),
+    commands: FurtherCommands = FurtherCommands(),
 ) -> Judgement:
     """Judge an evaluation by fixed limits; `intrinsics` is what the training found wrong with them ("": nothing).
 
     `steps` says how long the surface was trained, None where that is not known, and `capture` what to capture next.
     `unplaced`: frames that the training could not place; a surface that they took part in is poor. `length_sigma`: 1
     sigma of distances across the surface, as a share of them (`lengths.typical_sigma`), None if it is not known.
-    `departed`: frames that ended far from their starting poses.
+    `departed`: frames that ended far from their starting poses. `commands`: to go on from here.
 
     The agreement of the frames with each other is judged as sl-process and sl-check judge it.
     """
@@ -215,45 +280,40 @@ def judge(
         judged(
             "Coordinate residual", fit.coordinate_px_median, "{:.2f} px", 0.6, 1.5, "≤ {} px",
             "Median distance between where the surface puts a pattern point and where it was decoded.",
-            "the surface does not match the captures: train longer, check the poses and the lens data, or decode "
-            "again",
+            f"the surface does not match the captures: {commands.for_disagreement}",
         ),
         judged(
             "Epipolar residual", fit.epipolar_px_median, "{:.2f} px", 0.5, 1.2, "≤ {} px",
             "Median distance of decoded points from their epipolar curve: it depends on the pose of each projector "
             "relative to its camera, and not on the surface.",
-            "refine the poses (refine-poses free), and check the intrinsics of camera and projector",
+            "train with --pipeline.model.refine-poses free, and calibrate the devices again with sl-calibrate",
         ),
         judged(
             "Pattern agreement", fit.pattern_cosine, "{:.3f}", 0.9, 0.75, "≥ {}",
             "Cosine between captured and rendered pattern over all lit pixels; 1 is identical up to brightness.",
-            "look at the pictures below: blur, ambient light or a wrong pattern file reduce it",
+            "look at the pictures of --report FILE.html: blur, ambient light or a wrong pattern file reduce "
+            "it; capture in less room light",
         ),
-        judged(
-            "Coverage", 100 * fit.hit_share, "{:.1f} %", 97.0, 85.0, "≥ {} %",
-            "Share of the pixels with pattern on the object at which the mesh has a surface.",
-            "export with --keep-unobserved to see whether too much of the surface was removed; otherwise add frames "
-            "that see the missing parts",
-        ),
-        *(judge_worst(figure, evaluation) for figure in WORST_FRAME),
+        coverage_figure(evaluation, commands),
+        *(judge_worst(figure, evaluation, commands) for figure in WORST_FRAME),
         _geometry(evaluation),
-        *([] if evaluation.completeness is None else completeness_figures(evaluation.completeness, evaluation.units)),
-        *([] if steps is None else [training_figure(steps)]),
+        *([] if evaluation.completeness is None else [holes_figure(evaluation.completeness, evaluation.units)]),
+        *([] if steps is None else [training_figure(steps, commands)]),
         *([] if length_sigma is None else [_lengths(length_sigma)]),
     ]  # fmt: skip
     if evaluation.reference is not None and evaluation.alignment in evaluation.surface:
         figures.insert(0, _accuracy(evaluation))
-    reasons = [Reason(f.band, f"{f.name}: {f.text} (good: {f.good})") for f in figures if f.band != "unknown"]
-    reasons += [Reason("acceptable", f"{f.name}: cannot be judged") for f in figures if f.band == "unknown"]
+    reasons = [
+        Reason(f.band, f"{f.name}: {f.text} (good: {f.good}); {f.advice}") for f in figures if f.band != "unknown"
+    ]
+    reasons += [Reason("acceptable", f"{f.name}: cannot be judged; {f.advice}") for f in figures if f.band == "unknown"]
+    reasons = [*(fault.reason for fault in evaluation.mesh_faults), *reasons]
     names = [frame.name for frame in evaluation.agreement.frames]
     if evaluation.cross is not None:
         reasons += cross_reasons(names, evaluation.cross)
-    reasons += [
-        Reason("poor", f"{name}: could not be placed; leave it out or register it again, and train again")
-        for name in unplaced
-    ]
+    reasons += [Reason("poor", f"{name}: could not be placed", "again") for name in unplaced]
     reasons += departed_reasons([one for one in departed if one.name not in unplaced])
-    verdict = worst(reasons)
+    verdict = worst(reasons).with_help(HELP)
     return Judgement(
         verdict, _sentence(verdict.band, evaluation), tuple(figures), _hints(evaluation, verdict.band, intrinsics),
         capture_next(evaluation, capture),
@@ -271,7 +331,8 @@ def _accuracy(evaluation: Evaluation) -> JudgedFigure:
         "Accuracy" if exact else "Distance from reference", percent,
         f"{{:.2f}} % of the size ({rmse:.3g} {evaluation.truth_units})", 0.25, 1.0,
         "≤ {} %", f"RMS distance {way} after {ALIGNED[evaluation.alignment]}, in percent of the size of the reference.",
-        "look for strong error colours: if everywhere, check poses and scale; if in patches, add frames there",
+        "look for error colours in the report: if everywhere, check the scale (--known-length of sl-process) and "
+        "the unit of the reference; if in patches, capture frames there",
     )  # fmt: skip
 
 
@@ -293,34 +354,23 @@ WORST_FRAME = (
         "Worst frame", "coordinate_px_median", True, 2.0, 4.0,
         "Median coordinate residual of the worst frame, relative to the median frame: no frame should contradict the "
         "others.",
-        "if its pose or decoding is wrong, leave the frame out and train again",
+        "if its pose or decoding is wrong, leave it out of transforms.json and train again",
     ),
     WorstFrameFigure(
         "Worst frame, 95 %", "coordinate_px_p95", True, 3.0, 6.0,
         "95 % of the coordinate residuals of a frame are smaller: its worst value, relative to the median frame.",
-        "part of the frame contradicts the surface: look at its residual map",
+        "part of the frame contradicts the surface; if it is its pose, leave it out of transforms.json and train again",
     ),
     WorstFrameFigure(
         "Agreement in the worst frame", "agreeing_share", False, 85.0, 65.0,
         "Share of a frame's decoded pixels whose predicted coordinate lies within 4 sigma of the measured noise of the "
         "decoded one, but not less than a camera pixel.",
-        "the surface does not match this frame: train longer, or check its pose",
-    ),
-    WorstFrameFigure(
-        "Coverage of the worst frame", "covered_share", False, 90.0, 75.0,
-        "Share of a frame's decoded pixels at which the mesh has a surface.",
-        "export with --keep-unobserved to see what was removed; otherwise look for holes in the view of this frame",
-    ),
-    WorstFrameFigure(
-        "Largest hole", "largest_hole", False, 0.5, 2.0,
-        "Largest connected area of decoded pixels whose rays meet no surface near the measured point, in percent of "
-        "the frame's decoded pixels; gaps along the rim do not count.",
-        "the surface is missing where it was measured: train longer, or export with a finer resolution",
+        "the surface does not match this frame: {disagrees}",
     ),
 )  # fmt: skip
 
 
-def judge_worst(figure: WorstFrameFigure, evaluation: Evaluation) -> JudgedFigure:
+def judge_worst(figure: WorstFrameFigure, evaluation: Evaluation, commands: FurtherCommands) -> JudgedFigure:
     """Judge the frame in which a figure is worst, by name."""
     sign = 1 if figure.good < figure.acceptable else -1
     frames = [f for f in evaluation.agreement.frames if math.isfinite(getattr(f, figure.key))]
@@ -336,7 +386,8 @@ def judge_worst(figure: WorstFrameFigure, evaluation: Evaluation) -> JudgedFigur
         value, form, limit = 100 * value, "{:.1f} %", "{} %"
     return judged(
         figure.name, value, f"{form} ({name})", figure.good, figure.acceptable, f"{'≤' if sign > 0 else '≥'} {limit}",
-        figure.meaning, f"look at {name or 'it'} in the report: {figure.advice}",
+        figure.meaning,
+        f"look at {name or 'it'} in the report: {figure.advice.format(disagrees=commands.for_disagreement)}",
     )  # fmt: skip
 
 
@@ -345,9 +396,10 @@ def _geometry(evaluation: Evaluation) -> JudgedFigure:
     return judged(
         "Ray angle", fit.ray_angle_deg, "{:.1f}°", 8.0, 4.0, "≥ {}°",
         f"Angle between camera ray and projector ray on the surface (median). Here one pattern pixel corresponds to "
-        f"{fit.depth_per_px:.3g} {evaluation.units} of depth; where that is a lot, a low residual proves little.",
+        f"{fit.depth_per_px:.3g} {unit_word(evaluation.units)} of depth; where that is a lot, a low residual proves "
+        "little.",
         "hold the projector farther from the camera in the next scan, or keep the calibrated relative pose "
-        "(refine-poses known-rig)",
+        "(--pipeline.model.refine-poses known-rig)",
     )  # fmt: skip
 
 
@@ -362,7 +414,7 @@ def _lengths(sigma: float) -> JudgedFigure:
 
 
 def _hints(evaluation: Evaluation, band: Band, intrinsics: str) -> tuple[str, ...]:
-    hints = []
+    hints = [fault.advice for fault in evaluation.mesh_faults]
     if _ORDER[band] and evaluation.starting_poses:
         hints.append(
             "These figures are for the scan's starting poses: if the surface was trained with refined ones, "

@@ -6,6 +6,7 @@ Poses are 4x4 matrices. An increment (v, w) moves by the exponential of its twis
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import permutations, product
 from math import atan2, factorial, sin, sqrt
 
 import numpy as np
@@ -216,6 +217,20 @@ class Similarity:
         out[:3, :3] = self.scale * self.R
         out[:3, 3] = self.t
         return out
+
+
+AXIS_TURNS: tuple[Float64[ndarray, "3 3"], ...] = tuple(
+    R
+    for order in permutations(range(3))
+    for signs in product((1.0, -1.0), repeat=3)
+    if np.linalg.det(R := np.eye(3)[list(order)] * np.array(signs)[:, None]) > 0
+)
+"""The 24 rotations that exchange axes."""
+
+
+def axis_words(R: Float64[ndarray, "3 3"]) -> str:
+    """The rows of one of them as axes: "x, -z, y"."""
+    return ", ".join(("-" if row.sum() < 0 else "") + "xyz"[int(np.abs(row).argmax())] for row in R)
 
 
 def angle_deg(R: Float[ndarray, "3 3"]) -> float:

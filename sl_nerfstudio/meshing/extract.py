@@ -331,7 +331,7 @@ def _no_surface(grid: SparseGrid) -> str:
     return (
         f"the field has no zero level in the box: it is {sign} everywhere, so there is no surface to export. "
         "The training has probably not begun to converge, or the scan's poses do not fit together: "
-        "look at the run in ns-viewer, train longer, and check the scan with sl-check."
+        "train it to its last step; if that was done, find the poses anew with sl-process, from the photographs."
     )
 
 

@@ -6,6 +6,7 @@ unit, and its GLB takes sRGB colours of vertices for linear ones.
 
 import io
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -312,7 +313,9 @@ def encode_las(
 
     header = laspy.LasHeader(point_format=_PLAIN if properties.colour is None else _COLOURED, version="1.4")
     header.offsets = points_m.mean(0)
-    header.scales = np.full(3, max(float(np.ptp(points_m, axis=0).max()), 1e-9) / _STEPS)
+    finest = max(float(np.ptp(points_m, axis=0).max()), 1e-9) / _STEPS
+    header.scales = np.full(3, 10.0 ** math.ceil(math.log10(finest)))  # readers show so many decimals
+    header.offsets = np.round(header.offsets / header.scales) * header.scales
     quality = properties.quality
     extra: dict[str, tuple[type, ndarray]] = {f"n{axis}": (np.float32, normals[:, k]) for k, axis in enumerate("xyz")}
     extra |= {
@@ -360,7 +363,7 @@ def write_points(
         raise UserError(
             f"{path}: not written, there is no point\n"
             "    cause:  no frame confirms any part of the surface\n"
-            "    remedy: check the scan with sl-check, and look at the run in ns-viewer"
+            "    remedy: train it to its last step; if that was done, find the poses anew with sl-process"
         )
     metres = UNITS[units] or 1.0
     if path.suffix.lower() == ".las":
@@ -422,7 +425,7 @@ def write_mesh(
         raise UserError(
             f"{path}: not written, {int((~np.isfinite(mesh.vertices)).any(1).sum())} vertices are not numbers\n"
             "    cause:  the training diverged, or the scan's poses are wrong\n"
-            "    remedy: check the scan with sl-check and train again"
+            "    remedy: train again; if it happens again, find the poses anew with sl-process"
         )
     placed = mesh.mapped(file_from_world(suffix, units))
     colour = None if properties is None else properties.colour

@@ -12,7 +12,6 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.distance import pdist
 from torch import Tensor
 
-from sl_nerfstudio.geometry.numerics import component_labels
 from sl_nerfstudio.meshing.extract import Field
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.visibility import Trimmed
@@ -200,7 +199,7 @@ def fill_holes(mesh: Mesh, trimmed: Trimmed, largest: float) -> FilledHoles:
     """
     removed = np.flatnonzero(~trimmed.kept)
     faces = mesh.faces[removed]
-    piece = _pieces(faces, len(mesh.vertices))
+    piece = Mesh(mesh.vertices, faces).component_of_faces()
     count = int(piece.max(initial=-1)) + 1
     holes = _bordered(mesh, faces, mesh.faces[trimmed.kept], piece, count)
     size = _sizes(mesh, faces, piece, holes, largest)
@@ -222,16 +221,6 @@ def _keys(faces: Int64[ndarray, "f 3"], vertices: int, reverse: bool = False) ->
     """A number for each directed side of each triangle, side by side, or for the same sides run through backwards."""
     a, b = (np.roll(faces, -1, 1), faces) if reverse else (faces, np.roll(faces, -1, 1))
     return (a * vertices + b).ravel()
-
-
-def _pieces(faces: Int64[ndarray, "f 3"], vertices: int) -> Int64[ndarray, "f"]:
-    """Number of the piece, from 0, of each triangle; triangles that share a side are in one."""
-    there, back = _keys(faces, vertices), _keys(faces, vertices, reverse=True)
-    _, side = np.unique(np.minimum(there, back), return_inverse=True)
-    triangle = np.repeat(np.arange(len(faces)), 3)
-    nodes = len(faces) + int(side.max(initial=-1)) + 1
-    label = component_labels(triangle, len(faces) + side.reshape(-1), nodes)[: len(faces)]
-    return np.unique(label, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
 def _bordered(

@@ -58,9 +58,13 @@ class Mesh:
         return bool((count == 1).all() and np.array_equal(there, back))
 
     def component_of_faces(self) -> Int64[ndarray, "f"]:
-        """Number of the connected piece, from 0, that each triangle lies in; pieces share no vertex."""
-        label = component_labels(self.faces[:, :2].ravel(), self.faces[:, 1:].ravel(), len(self.vertices))
-        return np.unique(label[self.faces[:, 0]], return_inverse=True)[1].reshape(-1).astype(np.int64)
+        """Number of the connected piece, from 0, that each triangle lies in; pieces share no edge, at most corners."""
+        edges = np.sort(self.edges(), axis=1)
+        _, edge = np.unique(edges, axis=0, return_inverse=True)
+        triangle = np.tile(np.arange(len(self.faces)), 3)
+        nodes = len(self.faces) + len(edges)
+        label = component_labels(triangle, len(self.faces) + edge.reshape(-1), nodes)[: len(self.faces)]
+        return np.unique(label, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
     def vertex_normals(self) -> Float64[ndarray, "v 3"]:
         """Unit normals, outward, weighted by area; zero where a vertex has no triangle with an area."""

@@ -600,6 +600,6 @@ def _nothing_observed(counts: FrameCounts) -> str:
     return (
         "the frames observed no part of the surface, so nothing is left of it\n"
         f"    cause:  {cause}: wrong poses or axes, or an unfinished training\n"
-        "    remedy: check the scan with sl-check and look at the run in ns-viewer; "
-        "--keep-unobserved writes the whole surface"
+        "    remedy: train it to its last step; if that was done, find the poses anew with sl-process, from the "
+        "photographs; --keep-unobserved writes the whole surface"
     )

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from sl_nerfstudio.bundle_adjustment.adjust import CrossValidation, cross_validate
+from sl_nerfstudio.bundle_adjustment.modes import Mode
 from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses, SelfCalibration
 from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.calibration.stated import describe_change
@@ -17,7 +18,7 @@ from sl_nerfstudio.model.pose_refinement import (
     pose_prior,
     scene_rig,
 )
-from sl_nerfstudio.review.verdict import DepartedFrame, describe_departed
+from sl_nerfstudio.review.verdict import DepartedFrame, describe_departed, other_places
 
 # Intrinsics that agree better with the captures: found before training, kept only if held-out pixels confirm them.
 
@@ -50,7 +51,7 @@ def refine_intrinsics(
     contradiction falls; held-out pixels then decide once between the first result and the last.
     """
     maps, held_out = maps_and_held_out(loaded.scan, loaded.samples)
-    once = replace(settings, other_minima=0)  # poses are adjusted again later
+    once = replace(settings, other_minima=False)  # poses are adjusted again later
 
     def adjusted_with(change: IntrinsicsChange) -> ScanAdjustment:
         scan = loaded.scan.with_intrinsics_change(change)
@@ -92,6 +93,18 @@ def unplaced_message(names: Sequence[str]) -> str:
         f"Frames that cannot be placed: {', '.join(names)}. They do not see the surface on which the others agree.\n"
         "    cause:  their starting poses are far off, or their coordinates are decoded wrongly\n"
         "    remedy: remove them from transforms.json, or register the captures again (sl-process)"
+    )
+
+
+def modes_message(modes: Sequence[Mode], names: Sequence[str]) -> str:
+    """Which frames may stand elsewhere, and how likely; "" if none may."""
+    if not modes:
+        return ""
+    listed = "\n".join(f"    {place.sentence()}" for place in other_places(modes, names))
+    return (
+        f"Frames that may stand elsewhere, by what was captured:\n{listed}\n"
+        "    cause:  the object looks nearly the same from there\n"
+        "    remedy: capture views in between, or more of what tells its sides apart"
     )
 
 

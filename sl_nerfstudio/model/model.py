@@ -20,7 +20,13 @@ from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.field.field import CachedGrid, FieldConfig, SDFField
 from sl_nerfstudio.geometry.devices import DeviceKind, Intrinsics
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, rotate
-from sl_nerfstudio.model.messages import contradiction_message, departed_message, poses_message, unplaced_message
+from sl_nerfstudio.model.messages import (
+    contradiction_message,
+    departed_message,
+    modes_message,
+    poses_message,
+    unplaced_message,
+)
 from sl_nerfstudio.model.outputs import (
     History,
     MeasuredCoordinates,
@@ -282,7 +288,9 @@ class SLModel(Model):
             rig = found.rig
             self.device_poses.note(found.sigma, found.factor, found.intrinsics, found.unplaced)
             cameras = [frame.camera for frame in self.scan.frames]
-            said += [poses_message(found), unplaced_message([self.scan.frames[k].name for k in found.unplaced])]
+            names = [frame.name for frame in self.scan.frames]
+            said += [poses_message(found), unplaced_message([names[k] for k in found.unplaced])]
+            said.append(modes_message(found.modes, names))
             if found.intrinsics is not None:
                 said.append(contradiction_message(found.intrinsics, cameras, self.scan.projector))
         if c.renders_poses:

@@ -275,6 +275,9 @@ def require_together(config: SLPipelineConfig, weights: Mapping[str, Any], root:
     require_same_scan(root, scan, config.scan_fingerprint, "this run")
 
 
+_REDECODED = "redecoding.json"  # in scans of sl-redecode
+
+
 def what_next(config: Path, scan: Path, decoded: float) -> str:
     """Where the result is, and the commands to continue with; `decoded` is a share of the pixels with the pattern."""
     settings, data, poses = short_path(config), short_path(scan), "refined/transforms.json"
@@ -284,7 +287,7 @@ def what_next(config: Path, scan: Path, decoded: float) -> str:
         command("sl-eval", "--mesh", "mesh.ply", "--data", data, "--poses", poses, "--report", "report.html"),
     ]
     parts = [paragraph("result", f"{settings.parent}")]
-    if decoded < _WELL_DECODED:
+    if decoded < _WELL_DECODED and not (scan / _REDECODED).exists():  # a second time adds little
         share = f"{decoded:.0%} of the pixels with the pattern"
         again = command("sl-redecode", "--load-config", settings, "--output", data.with_name(f"{data.name}-again"))
         parts.append(paragraph("decoded", f"{share}; this surface shows how to decode more, which helps the poses:"))

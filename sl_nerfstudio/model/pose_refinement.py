@@ -24,6 +24,7 @@ from sl_nerfstudio.bundle_adjustment.covariance import (
     of_all_lengths,
     with_known_length,
 )
+from sl_nerfstudio.bundle_adjustment.modes import Mode
 from sl_nerfstudio.bundle_adjustment.parameters import (
     INTRINSICS_SIGMA,
     UNKNOWNS,
@@ -74,6 +75,7 @@ class ScanAdjustment:
     intrinsics: SelfCalibration | None  # None where nothing was adjusted
     unplaced: tuple[int, ...]  # frames that do not agree with the others
     cross_validation: CrossValidation | None = None  # None before it was done
+    modes: tuple[Mode, ...] = ()  # other poses that remain possible, the most probable first; axes are the scene's
 
     @property
     def adjusted(self) -> bool:
@@ -121,7 +123,7 @@ def adjust_scan(
         return replace(found, cross_validation=decision)
     nothing_learnt = decision.worse or refine == "off"
     sigma, factor = (stated.sigma, joint_of_prior(stated, start)) if nothing_learnt else _known_by_both(start, found)
-    return replace(found, rig=start, sigma=sigma, factor=factor, cross_validation=decision)
+    return replace(found, rig=start, sigma=sigma, factor=factor, cross_validation=decision, modes=())
 
 
 def _known_by_both(start: Rig, found: ScanAdjustment) -> tuple[Float[Tensor, "frames 12"], Float[Tensor, "joint k"]]:
@@ -153,11 +155,13 @@ def adjusted(
     cameras = torch.where(wrong[:, None, None], found.start.T_world_camera, start.T_world_camera)
     start = replace(start, T_world_camera=cameras)
     rig = restore(start, found.rig, _scale(scan, S_scene_world, refine, start, found.rig, prior))
-    factor = torch.from_numpy(JointCovariance(found.factor.numpy()).mapped(_motion(found.rig, rig)).factor)
+    motion = _motion(found.rig, rig)
+    factor = torch.from_numpy(JointCovariance(found.factor.numpy()).mapped(motion).factor)
     known = known_length(scan, S_scene_world, refine, rig, prior)
     return ScanAdjustment(
-        rig, found.sigma, with_known_length(factor, rig, known), found.noise_px, found.intrinsics, found.unplaced
-    )
+        rig, found.sigma, with_known_length(factor, rig, known), found.noise_px, found.intrinsics, found.unplaced,
+        modes=tuple(mode.turned(motion.R) for mode in found.modes),
+    )  # fmt: skip
 
 
 def _motion(before: Rig, after: Rig) -> Similarity:

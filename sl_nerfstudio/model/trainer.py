@@ -160,6 +160,16 @@ class SLTrainerConfig(TrainerConfig):
     def _continue(self) -> Checkpoint | None:
         """For the config.yml of an earlier run: go on where its last checkpoint is, up to the run's last step."""
         assert self.last_step is not None
+        root = self._scan_root()
+        if not (root / "transforms.json").is_file():
+            self.data = Path("FOLDER")
+            last = [int(path.stem.removeprefix("step-")) for path in checkpoints_in(self.get_checkpoint_dir())[-1:]]
+            left = self.last_step - (last[0] if last else -1)
+            raise UserError(
+                f"{root}: has no transforms.json, so the scan that this run was trained on is not there\n"
+                "    cause:  the scan was moved, renamed or deleted after the training, and --load-config takes all "
+                f"settings from config.yml\n    remedy: with its folder: {self._further_command(left)}"
+            )
         if checkpoints_in(self.get_checkpoint_dir()):
             self.load_dir, self.load_step, self.load_checkpoint = self.get_checkpoint_dir(), None, None
         begun = self.prepare()
@@ -173,11 +183,11 @@ class SLTrainerConfig(TrainerConfig):
         self.max_num_iterations = self.last_step - done
         return begun
 
-    def _further_command(self) -> str:
+    def _further_command(self, iterations: int = 500) -> str:
         assert self.method_name is not None and self.data is not None and self.experiment_name is not None
         words = ["ns-train", self.method_name, "--data", self.data, "--load-dir", self.get_checkpoint_dir()]
         words += ["--output-dir", self.output_dir, "--experiment-name", self.experiment_name]
-        words += ["--timestamp", self.timestamp, "--max-num-iterations", 500]
+        words += ["--timestamp", self.timestamp, "--max-num-iterations", iterations]
         return shlex.join(map(str, words))
 
     def _take_folder(self, begun: Checkpoint | None) -> None:
@@ -253,6 +263,13 @@ def _with_length(scheduler: SchedulerConfig | None, steps: int) -> SchedulerConf
     if isinstance(scheduler, DecaySchedulerConfig) and scheduler.max_steps is None:
         return replace(scheduler, max_steps=steps)
     return scheduler
+
+
+_FIRST = ("data", "output_dir", "experiment_name", "timestamp", "max_num_iterations", "load_dir", "load_config",
+          "schedule_iterations", "verbose", "cuda_graph", "tf32", "pipeline")  # fmt: skip
+_fields = SLTrainerConfig.__dataclass_fields__
+# --help shows fields in their order: those that users of this method set come before the rest of nerfstudio's
+SLTrainerConfig.__dataclass_fields__ = {name: _fields[name] for name in (*_FIRST, *_fields)}
 
 
 def default_device() -> Literal["cpu", "cuda"]:

@@ -18,27 +18,17 @@ from numpy import ndarray
 from PIL import Image, ImageDraw, ImageFont
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.scan.lengths import parse_length
 
 # What a user types about a board: "9x7" and "75 mm".
 
-_MILLIMETRES = {"m": 1e3, "cm": 10.0, "mm": 1.0, "um": 1e-3, "in": 25.4}
-_LENGTH = re.compile(r"(\d+(?:\.\d*)?|\.\d+) *([a-z]+)")
 _COUNTS = re.compile(r"(\d{1,4}) *[xX\u00d7] *(\d{1,4})")
-_MOST = 1e5  # millimetres
+_LEAST_METRES, _MOST_METRES = 1e-9, 100.0  # of a board's squares
 
 
 def millimetres(text: str, flag: str) -> float:
     """A length with its unit, such as "75 mm", in millimetres. Raises UserError that names the flag."""
-    length = _LENGTH.fullmatch(text.strip())
-    if length is None or length[2] not in _MILLIMETRES:
-        raise UserError(
-            f'{flag} "{text}": is no length with a unit\n    cause:  a typing error, or no unit\n'
-            f'    remedy: write for example {flag} "75 mm"; units are {", ".join(_MILLIMETRES)}'
-        )
-    value = float(length[1]) * _MILLIMETRES[length[2]]
-    if not 0 < value <= _MOST:
-        raise UserError(f'{flag} "{text}": give a length above 0 and up to {_MOST / 1e3:g} m')
-    return value
+    return 1e3 * parse_length(text, f'{flag} "{text}"', _LEAST_METRES, _MOST_METRES).metres
 
 
 def counts(text: str, flag: str) -> tuple[int, int]:

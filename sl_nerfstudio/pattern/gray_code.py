@@ -5,7 +5,7 @@ by its inverse), then the bits of the row in the same way. Neighbouring cells di
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxtyping import Float32, Float64, Int, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.pattern.layout import (
+    CENTRED,
     ORDERS,
     PatternLayout,
     Scope,
@@ -35,6 +36,8 @@ class GrayCode(PatternLayout):
     cell: int = 2
     shown: tuple[ShownImage, ...] = ()
     """What each image shows, in the order of projection; empty: the order of sl-pattern."""
+    centred: bool = False
+    """Cells are numbered so that the middle of the pattern has the middle of all codes; otherwise from 0."""
 
     def __post_init__(self) -> None:
         """Raises ValueError for sizes that do not make a sequence, and for images that do not determine the cell."""
@@ -44,8 +47,10 @@ class GrayCode(PatternLayout):
                 f"in cells of {self.cell}"
             )
         if not self.shown:
-            object.__setattr__(self, "shown", tuple(ORDERS["sl-pattern"](self._scope)))
+            object.__setattr__(self, "shown", tuple(ORDERS["sl-pattern"](self.scope)))
         check_shown(self.shown, self.bits, (self.w, self.h))
+        if not any(self._free_codes):  # then both numberings are one
+            object.__setattr__(self, "centred", False)
 
     @staticmethod
     def in_order(
@@ -55,8 +60,9 @@ class GrayCode(PatternLayout):
 
         Raises ValueError for sizes that do not make a sequence.
         """
-        scope = GrayCode(w, h, cell)._scope
-        return GrayCode(w, h, cell, tuple(ORDERS[name](Scope(scope.size, scope.bits, periods or scope.periods))))
+        scope = GrayCode(w, h, cell).scope
+        shown = tuple(ORDERS[name](Scope(scope.size, scope.bits, periods or scope.periods)))
+        return GrayCode(w, h, cell, shown, name in CENTRED)
 
     @property
     def columns(self) -> int:
@@ -81,7 +87,7 @@ class GrayCode(PatternLayout):
     @property
     def order(self) -> str:
         """Names of the programs that use this order, or "its own"."""
-        return ", ".join(order_names(self.shown, self._scope)) or "its own"
+        return ", ".join(order_names(self.shown, self.scope, self.centred)) or "its own"
 
     def place(self, shown: ShownImage) -> int | None:
         """Index in the sequence of the image that shows this; None if there is none."""
@@ -92,10 +98,8 @@ class GrayCode(PatternLayout):
 
         The inverse is None if the sequence has none. The list is empty if the axis has sines alone.
         """
-        bits = reversed(range(self.bits[axis] if ShownImage("bit", axis, 0) in self.shown else 0))
-        return [
-            (self.shown.index(ShownImage("bit", axis, k)), self.place(ShownImage("bit", axis, k, True))) for k in bits
-        ]
+        bits = (ShownImage("bit", axis, k) for k in reversed(range(self.bits[axis])))
+        return [(self.shown.index(bit), self.place(replace(bit, inverse=True))) for bit in bits if bit in self.shown]
 
     def sines(self, axis: int) -> list[tuple[int, float]]:
         """Steps and period (pattern pixels) of every sine along an axis, the longest first."""
@@ -130,28 +134,43 @@ class GrayCode(PatternLayout):
 
     def finest(self, axis: int) -> ShownImage:
         """The finest stripes along an axis: those of the last bit, otherwise the shortest sine."""
-        if ShownImage("bit", axis, 0) in self.shown:
-            return ShownImage("bit", axis, 0)
+        bits = self.bit_images(axis)
+        if bits:
+            return self.shown[bits[-1][0]]
         steps, period = self.sines(axis)[-1]
         return ShownImage("phase", axis, 0, False, steps, period)
 
     def fields(self) -> dict[str, Any]:
         """The side of a cell, and what each image of the sequence shows."""
-        return {"cell": self.cell, "sequence": [str(shown) for shown in self.shown]}
+        centred = {"centred": True} if self.centred else {}
+        return {"cell": self.cell, **centred, "sequence": [str(shown) for shown in self.shown]}
 
     @classmethod
     def from_document(cls, document: dict[str, Any]) -> "GrayCode":
         """The sequence that a pattern.json describes; without a list of images, in the order of sl-pattern."""
         w, h, cell = (whole_number(document, key) for key in ("w", "h", "cell"))
+        centred = document.get("centred", False)
+        if not isinstance(centred, bool):
+            raise ValueError("centred is neither true nor false")
         if "sequence" not in document:
-            return cls(w, h, cell)
+            return cls(w, h, cell, centred=centred)
         names = document["sequence"]
         if not isinstance(names, list) or not names:
             raise ValueError("sequence is no list of what the images show")
-        return cls(w, h, cell, tuple(ShownImage.of(name) for name in names))
+        return cls(w, h, cell, tuple(ShownImage.of(name) for name in names), centred)
+
+    def first_code(self, axis: int) -> int:
+        """Number of the first cell of an axis."""
+        return self._free_codes[axis] // 2 if self.centred else 0
 
     @property
-    def _scope(self) -> Scope:
+    def _free_codes(self) -> tuple[int, int]:
+        """Codes of each axis that no cell has."""
+        return (1 << self.bits[0]) - self.columns, (1 << self.bits[1]) - self.rows
+
+    @property
+    def scope(self) -> Scope:
+        """What the orders of programs depend on."""
         x, y = (min((sine[1] for sine in self.sines(axis)), default=float(max(self.cell, 2))) for axis in (0, 1))
         return Scope((self.w, self.h), self.bits, (x, y))
 
@@ -161,7 +180,8 @@ class GrayCode(PatternLayout):
         if shown.what == "phase":
             return 0.5 + 0.5 * np.cos(2 * np.pi * (pixel / shown.period - shown.index / shown.steps))
         if shown.what == "bit":
-            return ((gray(pixel // self.cell) >> shown.index & 1) == (0 if shown.inverse else 1)).astype(np.float64)
+            code = gray(pixel // self.cell + self.first_code(shown.axis))
+            return ((code >> shown.index & 1) == (0 if shown.inverse else 1)).astype(np.float64)
         return np.full(len(pixel), 1.0 if shown.what == "white" else 0.0)
 
 

@@ -103,6 +103,7 @@ def _is_table(value: Any) -> bool:
 # - OpenCV, `structured_light::GrayCodePattern` and its sample `cap_pattern`; procam-calibration takes them from
 # there;
 # - 3DUNDERWORLD-SLS, `GrayCode`, which is also the order of sl-pattern;
+# - scan3d-capture of Moreno and Taubin, which numbers the cells from the middle of the code;
 # - SLStudio, `CodecGrayCode` (no inverses) and `CodecPhaseShift3Unwrap` (three shifts of a sine, then three of a
 # sine
 #   that has one period).
@@ -182,6 +183,13 @@ def _opencv(scope: Scope) -> list[ShownImage]:
     return [*bits_with_inverses(0, scope.bits[0]), *bits_with_inverses(1, scope.bits[1]), *HEAD]
 
 
+def _scan3d(scope: Scope) -> list[ShownImage]:
+    """As many bits of the one axis as of the other: the finest of the longer axis are not shown."""
+    count = 2 * min(scope.bits)
+    both = [bits_with_inverses(axis, scope.bits[axis])[:count] for axis in (0, 1)]
+    return [*HEAD, *both[0], *both[1]]
+
+
 def _alone(scope: Scope) -> list[ShownImage]:
     return [*HEAD, *bits_alone(0, scope.bits[0]), *bits_alone(1, scope.bits[1])]
 
@@ -197,24 +205,29 @@ def _slstudio(scope: Scope) -> list[ShownImage]:
 
 
 SequenceName = Literal[
-    "sl-pattern", "opencv", "procam", "3dunderworld", "no-inverses", "phase-gray", "slstudio", "slstudio-gray"
-]
+    "sl-pattern", "opencv", "procam", "3dunderworld", "scan3d-capture", "no-inverses", "phase-gray", "slstudio",
+    "slstudio-gray",
+]  # fmt: skip
 ORDERS: dict[str, Callable[[Scope], list[ShownImage]]] = {
     "sl-pattern": _ours,
     "opencv": _opencv,
     "procam": _opencv,
     "3dunderworld": _ours,
+    "scan3d-capture": _scan3d,
     "no-inverses": _alone,
     "phase-gray": _phase_and_gray,
     "slstudio": _slstudio,
     "slstudio-gray": _alone,
 }
 """By the name for --sequence. Some programs share an order."""
+CENTRED = ("scan3d-capture",)
+"""Programs that number the cells so that the middle of the pattern has the middle of all codes."""
 
 
-def order_names(shown: Sequence[ShownImage], scope: Scope) -> list[str]:
+def order_names(shown: Sequence[ShownImage], scope: Scope, centred: bool = False) -> list[str]:
     """Names of the programs that show exactly this; empty for an order of its own."""
-    return [name for name, order in ORDERS.items() if tuple(order(scope)) == tuple(shown)]
+    orders = {name: order for name, order in ORDERS.items() if (name in CENTRED) == centred}
+    return [name for name, order in orders.items() if tuple(order(scope)) == tuple(shown)]
 
 
 def check_shown(shown: Sequence[ShownImage], bits: tuple[int, int], size: tuple[int, int]) -> None:
@@ -244,8 +257,10 @@ def check_shown(shown: Sequence[ShownImage], bits: tuple[int, int], size: tuple[
 
 
 def _check_bits(own: Sequence[ShownImage], axis: str, bits: int, inverses: bool) -> None:
-    expected = {(k, inverse) for k in range(bits) for inverse in ((False, True) if inverses else (False,))}
     found = {(item.index, item.inverse) for item in own}
+    finest = min((index for index, _ in found), default=0)  # finer ones need not be shown
+    shown = range(min(finest, bits - 1), bits)
+    expected = {(k, inverse) for k in shown for inverse in ((False, True) if inverses else (False,))}
     if own and found != expected:
         wrong = sorted(str(ShownImage("bit", "xy".index(axis), *item)) for item in found ^ expected)
         raise ValueError(f"sequence has {bits} bits of {axis}; missing or too many: {', '.join(wrong[:6])}")

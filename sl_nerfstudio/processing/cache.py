@@ -2,13 +2,14 @@
 
 import platform
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, TypeVar
 from zipfile import BadZipFile
 
+from sl_nerfstudio.bundle_adjustment.modes import Mode
 from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.geometry.devices import Device
@@ -33,7 +34,7 @@ VERSIONS = {
     "test of intrinsics": 1,  # relative_pose/intrinsics.py
     "static projector": 1,  # registration/static_projector.py
     "registration": 1,  # registration/
-    "adjustment": 1,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
+    "adjustment": 2,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
 }
 """Number of each stage. Raise it whenever the stage, or anything that it calls, may give another result from the same
 inputs: another algorithm, constant, order of summation or field of a result. Names, comments and speed need none.
@@ -43,7 +44,7 @@ KEPT: tuple[type, ...] = (
     result.Registration, result.Edge, result.SurfaceDisagrees, result.NoCommonSurface, result.SeparateComponent,
     result.PoorPair, result.PairsContradict, result.CoordinatesDisagree, result.UndecidedProjector,
     result.UncertainRotation, result.SeparatePoses,
-    ConsistentFrames, AdjustedFrames, DevicePoses, PoseSigma, SelfCalibration,
+    ConsistentFrames, AdjustedFrames, Mode, DevicePoses, PoseSigma, SelfCalibration,
     Device, ProjectorEstimate, NoProjector, StaticPlacement, NoPlacement, IntrinsicsEvidence,
     DeviceEvidence,
     CrossFrameAgreement, FrameCrossAgreement, PairAgreement, RelativePose, Degeneracy,
@@ -82,6 +83,8 @@ class StageStore:
         path = self._folder / f"{' '.join(filter(None, (stage, frame)))}-{key[:KEY_LENGTH]}.npz"
         stored = _stored(path)
         if stored is not None and stored[0] == key:
+            with suppress(OSError):
+                path.touch()  # used: not among the oldest
             self._log(f"{stage}: kept from an earlier run")
             return stored[1]
         content = encode((key, compute()))
@@ -116,3 +119,17 @@ def work_folder(root: Path) -> Iterator[None]:
         finally:
             for folder in folders:
                 remove_partial(folder)
+                _remove_oldest(folder)
+
+
+MOST_KEPT = 16  # results of one stage, or of one frame: so many can be gone back to
+
+
+def _remove_oldest(folder: Path) -> None:
+    """Keep the results that were made or used last; those of one stage or frame differ by the key in their names."""
+    alike: dict[str, list[Path]] = {}
+    for path in folder.glob("*-*.npz"):
+        alike.setdefault(path.name.rpartition("-")[0], []).append(path)
+    for paths in alike.values():
+        for path in sorted(paths, key=lambda path: path.stat().st_mtime_ns)[:-MOST_KEPT]:
+            path.unlink(missing_ok=True)

@@ -1,24 +1,27 @@
 """The photographs of each frame, and the Gray-code sequence that they show."""
 
+import math
 import os
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Float32, Float64, Int64
+from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoder import DecodingError
-from sl_nerfstudio.decoding.decoders import GrayCodeDecoder
-from sl_nerfstudio.decoding.gray_code import check_count
-from sl_nerfstudio.decoding.gray_code_order import layout_of_images, possible_layouts
+from sl_nerfstudio.decoding.gray_code import check_count, decode_gray_code, take_samples
+from sl_nerfstudio.decoding.gray_code_order import check_order, layout_of_images, possible_layouts, with_numbering
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.gray_code import GrayCode
-from sl_nerfstudio.pattern.layout import PatternLayout, SequenceName
+from sl_nerfstudio.pattern.layout import CENTRED, PatternLayout, SequenceName
 from sl_nerfstudio.processing.config import FEWEST_FRAMES
+from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError, unreadable
 from sl_nerfstudio.scan.images import ENDINGS, RAW, photograph_header, raw_file, read_photograph, turned_by_tag
 
@@ -40,10 +43,13 @@ class SeveralFaults(FileError):
 
     def __init__(self, folder: Path, errors: Sequence[FileError]) -> None:
         """`folder` holds the frame's images."""
-        listed = [f"{e.path.name if e.path != folder else 'the folder'} {e.problem}" for e in errors]
-        more = f"; and {len(listed) - _LISTED} more" if len(listed) > _LISTED else ""
+        same: dict[str, list[str]] = {}
+        for e in errors:
+            same.setdefault(e.problem, []).append(e.path.name if e.path != folder else "the folder")
+        found = [f"{listed(n, _LISTED)}{': each' if len(n) > 1 else ''} {problem}" for problem, n in same.items()]
+        more = f"; and {len(found) - _LISTED} more" if len(found) > _LISTED else ""
         causes, remedies = (dict.fromkeys(getattr(e, key) for e in errors) for key in ("cause", "remedy"))
-        problem = f"has {len(errors)} faults: {'; '.join(listed[:_LISTED])}{more}"
+        problem = f"has {len(errors)} faults: {'; '.join(found[:_LISTED])}{more}"
         super().__init__(folder, problem, "; ".join(causes), "; ".join(remedies))
         self.errors = tuple(errors)
 
@@ -75,12 +81,18 @@ class Captures:
         return replace(self, faults={name: _together(named[name], errors) for name, errors in both.items()})
 
 
-def find_captures(root: Path, sequences: bool, cameras: Sequence[str] = ()) -> Captures:
+def find_captures(
+    root: Path,
+    sequences: bool,
+    cameras: Sequence[str] = (),
+    needs: str = f"a scan needs at least {FEWEST_FRAMES} frames",
+) -> Captures:
     """Frames in a folder: one image each or, with `sequences`, one sub-folder of images each.
 
     With the names of several `cameras`, the frames of each are in a sub-folder of that name. Of each camera the most
     frequent image size is taken to be right. Images of another size, and images that cannot be read, are faults of
-    their frames. Raises FileError if there are fewer than two frames, or no folder for a camera.
+    their frames. Raises FileError, which says what `needs` how many, if there are fewer than two frames, or no folder
+    for a camera.
     """
     if not os.path.isdir(root):  # Path.is_dir raises for a name that is too long
         raise FileError(root, "is no folder", "a typing error in --images", "give the folder with the captures")
@@ -88,7 +100,7 @@ def find_captures(root: Path, sequences: bool, cameras: Sequence[str] = ()) -> C
         found = _of_cameras(root, sequences, cameras) if cameras else [_frames(root, sequences)]
         frames = [frame for turn in zip_longest(*found) for frame in turn if frame is not None]
         if len(frames) < FEWEST_FRAMES:
-            raise _too_few(root, sequences, len(frames))
+            raise _too_few(root, sequences, len(frames), needs)
     except OSError as error:
         raise unreadable(root, error) from error
     duplicates = [name for name, count in Counter(f.name for f in frames).items() if count > 1]
@@ -99,20 +111,30 @@ def find_captures(root: Path, sequences: bool, cameras: Sequence[str] = ()) -> C
     return _checked(frames)
 
 
-def _too_few(root: Path, sequences: bool, count: int) -> FileError:
+def _too_few(root: Path, sequences: bool, count: int, needed: str) -> FileError:
+    inside = [
+        path for path in sorted(root.iterdir()) if path.is_dir() and len(_frames(path, sequences)) > max(count, 1)
+    ]
+    if len(inside) == 1 and not _images(root):
+        return FileError(
+            root,
+            f"holds its captures in a folder of its own, {inside[0].name}",
+            "--images is the folder with the captures, not the one around it",
+            f"give --images {inside[0]}",
+        )
     raw = _images(root, RAW)
     if raw:
         return raw_file(raw[0])
     what = "folders with images" if sequences else "images"
     other = _single_images(root) if sequences else _folders(root)
     cause, remedy = "a typing error in --images, or images of another format", ""
+    if count:
+        cause = f"too few were captured, or {cause}"
     if len(other) > 1:
         cause = "the captures do not suit the pattern: a coded grid needs one image per frame, Gray code one sub-folder"
         remedy = "" if sequences else '; for several cameras, name them under "cameras" in the intrinsics file'
     wanted = "sub-folders, one for each frame" if sequences else f"{', '.join(ENDINGS)} files"
-    return FileError(
-        root, f"holds {count} {what}; a scan needs at least 2 frames", cause, f"give a folder of {wanted}{remedy}"
-    )
+    return FileError(root, f"holds {count} {what}; {needed}", cause, f"give a folder of {wanted}{remedy}")
 
 
 def _of_cameras(root: Path, sequences: bool, cameras: Sequence[str]) -> list[list[CapturedFrame]]:
@@ -150,7 +172,7 @@ def _checked(frames: Sequence[CapturedFrame]) -> Captures:
         own = [path for frame in frames if frame.camera == camera for path in frame.images]
         known = [sizes[path] for path in own if path in sizes]
         if not known:
-            raise next(faults[frame.name][0] for frame in frames if frame.camera == camera)
+            raise _of_a_kind([e for frame in frames if frame.camera == camera for e in faults[frame.name]])[0]
         usual[camera] = Counter(known).most_common(1)[0][0]
     for frame in frames:
         for path in frame.images:
@@ -158,6 +180,24 @@ def _checked(frames: Sequence[CapturedFrame]) -> Captures:
                 faults.setdefault(frame.name, []).append(_other_size(path, sizes[path], usual[frame.camera]))
     named = {frame.name: frame for frame in frames}
     return Captures(tuple(frames), usual, {name: _together(named[name], found) for name, found in faults.items()})
+
+
+def describe_faults(captures: Captures) -> list[str]:
+    """What is wrong with the frames that cannot be used, in one message for each kind of fault."""
+    return list(map(str, _of_a_kind(list(captures.faults.values()))))
+
+
+def _of_a_kind(errors: Sequence[FileError]) -> list[FileError]:
+    """One error for all files with the same problem, which names them."""
+    same: dict[str, list[FileError]] = {}
+    for error in errors:
+        same.setdefault(error.problem, []).append(error)
+    out = []
+    for first, *others in same.values():
+        names = [error.path.name for error in others]
+        more = f" (and so {'are' if len(names) > 1 else 'is'} {listed(names, _LISTED)})" if names else ""
+        out.append(first if not more else FileError(first.path, first.problem + more, first.cause, first.remedy))
+    return out
 
 
 def _together(frame: CapturedFrame, errors: Sequence[FileError]) -> FileError:
@@ -218,6 +258,11 @@ def likely_layout(captures: Captures, name: SequenceName) -> GrayCode:
     """
     whole = captures.require_whole()
     count = len(whole[0].images)
+    if name in CENTRED:
+        raise UserError(
+            f"--sequence {name}: does not tell the projector's resolution\n    cause:  its codes depend on it\n"
+            "    remedy: give the resolution, as --pattern 1024x768"
+        )
     fitting = [layout for w, h in STANDARD if (layout := GrayCode.in_order(name, w, h)).images == count]
     if not fitting:
         raise FileError(
@@ -227,15 +272,117 @@ def likely_layout(captures: Captures, name: SequenceName) -> GrayCode:
             "give the projector's resolution, as --pattern 1024x768, or the pattern.json of what was projected",
         )
     reached = np.zeros(2)
-    largest = GrayCode.in_order(name, *(2**bits for bits in fitting[-1].bits))
-    for frame in whole[:_LOOKED_AT]:
+    for _, cells in _cells_of(whole, fitting[-1], 1):
+        reached = np.maximum(reached, _reach(cells))
+    return next((layout for layout in fitting if layout.w >= reached[0] and layout.h >= reached[1]), fitting[-1])
+
+
+def _cells_of(
+    frames: Sequence[CapturedFrame], layout: GrayCode, step: int
+) -> Iterator[tuple[CapturedFrame, Float32[ndarray, "h w 2"]]]:
+    """Place in cells of every `step`th pixel of the first frames, whatever their bits say; NaN where not decoded."""
+    columns, rows = (2**bits for bits in layout.bits)
+    largest = GrayCode(columns, rows, 1, layout.shown)
+    for frame in frames[:_LOOKED_AT]:
         try:
-            decoded = GrayCodeDecoder(largest).decode(frame.images)
+            images = [np.ascontiguousarray(read_photograph(path)[::step, ::step]) for path in frame.images]
+            if check_order(take_samples(images), largest).misplaced:
+                continue
+            yield frame, decode_gray_code(images, largest).coords
         except (DecodingError, FileError):
             continue  # said when this frame is read
-        codes = decoded.coords[decoded.decoded]
-        reached = np.maximum(reached, np.quantile(codes, 1 - _BEYOND, axis=0)) if len(codes) else reached
-    return next((layout for layout in fitting if layout.w >= reached[0] and layout.h >= reached[1]), fitting[-1])
+
+
+def _reach(cells: Float32[ndarray, "h w 2"]) -> Float64[ndarray, "2"]:
+    """How far the cells of a frame reach, but for misread ones."""
+    return np.nanquantile(cells.reshape(-1, 2), 1 - _BEYOND, axis=0)
+
+
+# Whether the pattern has the stated resolution: by cells that it cannot have, and by where its edge is.
+
+_IMPOSSIBLE = 5e-3  # share of a frame's decoded pixels beyond the edge that no misreading explains
+_SIDE = 800  # pixels of a photograph's longer side that are looked at
+_BANDS, _FEWEST_BANDS = 16, 6  # along an edge, that are compared
+_STRAIGHT = 0.75  # share of the bands in which the pattern must end at the same cell
+_LARGEST_CELL = 32
+_NEAR = 0.03  # distance of an edge from where a resolution has it, as a share: the camera may see it coarsely
+_MOST_LIKELY = 3  # resolutions that are named
+
+
+def _require_resolution(captures: Captures, layout: GrayCode) -> None:
+    """Raise FileError if the captures show that the projector has another resolution than that of `layout`.
+
+    Cells beyond the stated ones cannot be. Cells that are missing tell where the edge of the pattern is seen: all rows
+    end at the same column.
+    """
+    bits_only = [axis for axis in (0, 1) if layout.bit_images(axis) and not layout.sines(axis)]
+    if len(bits_only) < 2:
+        return
+    whole = captures.require_whole()
+    w, h = captures.size
+    stated = np.array([layout.columns, layout.rows])
+    for frame, cells in _cells_of(whole, layout, max(1, max(w, h) // _SIDE)):
+        known = cells[np.isfinite(cells).all(-1)]
+        beyond = (known > stated + 0.5).mean(0) > _IMPOSSIBLE
+        centred = (2 ** np.array(layout.bits) - stated) / 2  # by programs that count from the middle
+        low = np.quantile(known, _BEYOND, axis=0)
+        beyond &= ~((low > centred - 1) & (known < centred + stated + 1).all(0)) | (centred == 0)
+        edge = np.array([_edge(known, axis) for axis in (0, 1)])
+        missing = edge < (1 - _NEAR) * stated - 1.5
+        if not beyond.any() and not missing.all():
+            continue
+        reach = np.where(np.isfinite(edge), edge, np.ceil(_reach(cells))).astype(int)
+        likely = _likely_resolutions(layout, reach, edge)
+        if beyond.any():
+            cannot = (
+                f"which {layout.w} x {layout.h} pixels cannot have ({stated[0]} x {stated[1]} cells of {layout.cell})"
+            )
+        elif likely:
+            cannot = f"where it ends, and {layout.w} x {layout.h} pixels have {stated[0]} x {stated[1]} cells"
+        else:
+            continue  # something else than the edge of the pattern may have a straight border
+        cause = (
+            "--pattern gives another resolution than that of the projector, or of the window that showed the pattern"
+        )
+        size = f"--pattern {likely[0].split()[0]}" if likely else "the resolution of the projector"
+        raise FileError(
+            frame.images[0].parent,
+            f"shows {reach[0]} columns and {reach[1]} rows of cells, {cannot}",
+            cause + (f"; likely: {' or '.join(likely)}" if likely else ""),
+            f"give {size}, or the pattern.json of what was projected",
+        )
+
+
+def _edge(known: Float32[ndarray, "n 2"], axis: int) -> float:
+    """The cell at which the pattern ends along an axis, in most bands of the other; NaN if its edge is not seen."""
+    other = known[:, 1 - axis]
+    band = np.clip((_BANDS * (other - other.min()) / max(float(np.ptp(other)), 1e-9)).astype(int), 0, _BANDS - 1)
+    ends = [np.quantile(known[band == k, axis], 0.99) for k in range(_BANDS) if (band == k).sum() >= _BANDS]
+    if len(ends) < _FEWEST_BANDS:
+        return math.nan
+    end = float(np.quantile(ends, 0.75))
+    return float(round(end)) if np.mean(np.abs(np.array(ends) - end) < 1) >= _STRAIGHT else math.nan
+
+
+def _likely_resolutions(layout: GrayCode, reach: Int64[ndarray, "2"], edge: Float64[ndarray, "2"]) -> list[str]:
+    """Usual resolutions whose sequences have as many bits and room for these cells, "640x480 (cells of 2)".
+
+    Where the edge of the pattern is seen, theirs must be there; the nearest and the smallest come first.
+    """
+    found = []
+    for w, h in STANDARD:
+        for cell in range(1, min(_LARGEST_CELL, h // 2) + 1):
+            other = GrayCode(w, h, cell)
+            beyond = np.array([other.columns, other.rows]) - reach
+            far = np.where(np.isfinite(edge), np.abs(beyond) / reach, 0.0)
+            if (
+                other.bits == layout.bits
+                and (beyond >= -1).all()
+                and far.max() < _NEAR
+                and (w, h) != (layout.w, layout.h)
+            ):
+                found.append((round(far.max(), 2), cell, f"{w}x{h} (cells of {cell})"))
+    return [text for *_, text in sorted(found)[:_MOST_LIKELY]]
 
 
 # The sequence of a Gray code that another program showed: by its name, by the images, or both.
@@ -253,7 +400,7 @@ def describe_sequence(layout: GrayCode) -> str:
     """One line for the output."""
     return (
         f"Gray code of {layout.w} x {layout.h} pixels in cells of {layout.cell}: {layout.images} images, order "
-        f"{layout.order}"
+        f"{layout.order}{', cells numbered from the middle of the code' if layout.centred else ''}"
     )
 
 
@@ -300,19 +447,23 @@ def recognise_sequence(
     """The sequence that the captures show, for a projector of `size`; frames with faults are not looked at.
 
     Sequences that differ only where no image could tell are one. Raises UserError with the frame's folder if its images
-    fit no known sequence, or more than one, and if two frames show different ones.
+    fit no known sequence, or more than one, if two frames show different ones, and if the projector has another size.
     """
     whole = captures.require_whole()
     found: dict[GrayCode, Path] = {}
     errors: list[UserError] = []
+    centred = False
     for frame in whole[:_LOOKED_AT]:
         folder = frame.images[0].parent
         try:
             possible = possible_layouts(len(frame.images), size, name, cell)
+            images = [read_photograph(path) for path in frame.images]
             if len(possible) == 1 and possible[0].bit_images(0) and name is not None:
-                found.setdefault(possible[0], folder)  # nothing to recognise: a frame that does not fit says so itself
-                continue
-            found.setdefault(layout_of_images([read_photograph(p) for p in frame.images], size, name, cell), folder)
+                layout = with_numbering(possible[0], images)  # a frame that does not fit says so itself
+            else:
+                layout = layout_of_images(images, size, name, cell)
+            centred = centred or layout.centred  # a frame that shows the middle alone does not tell
+            found.setdefault(replace(layout, centred=False), folder)
         except FileError as error:
             errors.append(error)
         except DecodingError as error:
@@ -326,4 +477,6 @@ def recognise_sequence(
             f"{second.cell})\n    cause:  the folders hold captures of several sequences\n"
             "    remedy: process them separately, or name the sequence with --sequence"
         )
-    return next(iter(found))
+    layout = replace(next(iter(found)), centred=centred)
+    _require_resolution(captures, layout)
+    return layout

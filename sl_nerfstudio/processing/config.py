@@ -28,7 +28,7 @@ class ProcessConfig:
     """intrinsics of the camera, usually of both devices: .json, OpenCV .yml .xml, COLMAP cameras.txt; without those of
     the camera, its focal length comes from the photographs' EXIF data, and is refined"""
     output: Path = tyro.MISSING
-    """scan folder to write; it must be new or empty"""
+    """scan folder to write: new or empty, or the scan that this command made of the same captures, which is renewed"""
     projector_intrinsics: Path | None = None
     """file of the projector, if --intrinsics describes only the camera"""
     projector_model: Literal["OPENCV", "DOE"] | None = None
@@ -69,7 +69,7 @@ class ProcessConfig:
     them"""
     work: Path | None = None
     """folder in which decoded frames, the registration and the adjustment are kept for the next run; default:
-    OUTPUT.work"""
+    that of an earlier run with the same captures, else OUTPUT.work"""
     seed: int = 0
     """seed of all random choices: the same captures and flags give the same scan"""
 
@@ -90,11 +90,18 @@ class ProcessConfig:
                 f"--no-adjust and {other}: only the joint adjustment can do what {other} asks for\n"
                 "    remedy: leave one of them out"
             )
-        work, output = (os.path.realpath(path) for path in (self.work_folder, self.output))
-        if os.path.commonpath([work, output]) == output:
-            raise UserError(
-                f"--work {self.work_folder}: is in the output, which is to be a new folder; give another one"
-            )
+        work, output, images = (os.path.realpath(path) for path in (self.work_folder, self.output, self.images))
+        for flag, inner, outer, what in (
+            ("--output", output, images, "the captures, and would become one of them"),
+            ("--work", work, images, "the captures, and would become one of them"),
+            ("--work", work, output, "the output, which is to hold the scan alone"),
+        ):
+            if os.path.commonpath([inner, outer]) == outer:
+                path = self.output if flag == "--output" else self.work_folder
+                raise UserError(
+                    f"{flag} {path}: is in {what}\n    remedy: give a folder outside of it, such as "
+                    f"{Path(outer).parent / ('scan' if flag == '--output' else 'scan.work')}"
+                )
 
     @property
     def finds_projector(self) -> bool:

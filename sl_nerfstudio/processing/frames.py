@@ -39,6 +39,7 @@ from sl_nerfstudio.relative_pose.estimation import (
     estimate_relative_pose,
     relative_pose_near,
 )
+from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.images import as_grey, read_photograph
 
@@ -81,6 +82,7 @@ class FrameStageResult:
     stage: str = ""  # in which the frame failed: "reading", "decoding", "calibrating"; "" if it did not
     reason: str = ""  # problem, cause and remedy, with the file they are about
     matched: str = ""  # key of the frame matched along epipolar lines in the store; "" if it was not matched
+    notes: tuple[str, ...] = ()  # of the decoder, on the capture
 
     @property
     def name(self) -> str:
@@ -136,7 +138,8 @@ class FrameWorker:
             resumed = decoded is not None
             if decoded is None:
                 decoded = self._store.save(frame, key, self._job.decoder.decode(frame.images))
-            result = replace(result.showing(self._selected(frame.name, decoded)), key=key, resumed=resumed)
+            result = replace(result, key=key, resumed=resumed, notes=decoded.notes)
+            result = result.showing(self._selected(frame.name, decoded))
         except FileError as error:
             return result.failed("reading", str(error))
         except DecodingError as error:
@@ -174,7 +177,8 @@ class FrameWorker:
         except DecodingError as error:  # nothing that was matched is inside the user's mask
             return result.failed("decoding", self._with_file(result.frame, error))
         except RelativePoseError as error:
-            return result.failed("calibrating", self._with_file(result.frame, error))
+            noted = "".join(f"\n    note:   {note}" for note in result.notes)
+            return result.failed("calibrating", self._with_file(result.frame, error) + noted)
         return replace(result, cloud=cloud)
 
     def _pose(self, result: FrameStageResult, decoded: Decoded, near: RelativePose | None = None) -> RelativePose:
@@ -326,6 +330,15 @@ def run_frame_stage_again(
     """Run the frame stage with another job, on frames that this run has decoded."""
     resumed = {result.name: result.resumed for result in before}
     return [replace(r, resumed=resumed[r.name]) for r in run_frame_stage(config, job, captures)]
+
+
+def capture_sentences(noted: Sequence[tuple[str, Sequence[str]]]) -> list[str]:
+    """What the decoder noted on frames, by their names: each note once with the frames that it is about."""
+    found: dict[str, list[str]] = {}
+    for name, notes in noted:
+        for note in notes:
+            found.setdefault(note, []).append(name)
+    return [f"{'all' if len(names) == len(noted) else listed(names)}: {note}" for note, names in found.items()]
 
 
 def describe_frame_stage(results: Sequence[FrameStageResult]) -> str:

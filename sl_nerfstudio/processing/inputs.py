@@ -94,9 +94,10 @@ def require_intrinsics(config: ProcessConfig, projector_needed: bool) -> None:
     """Raise UserError if no file is given, although the projector's intrinsics must be in one."""
     if projector_needed and config.intrinsics is None and config.projector_intrinsics is None:
         raise UserError(
-            "--intrinsics: no file is given\n    cause:  the intrinsics of the projector must be known\n"
-            "    remedy: give a file with camera and projector, or with the projector alone if the photographs state "
-            "the camera's focal length; sl-calibrate makes one"
+            "--intrinsics: no file is given\n    cause:  the intrinsics of both devices must be known, or found\n"
+            "    remedy: make a file with sl-calibrate; or give the camera's alone (sl-calibrate --camera-only) and "
+            "find the projector's from the captures: --estimate-projector; or the projector's alone, if the "
+            "photographs state the camera's focal length"
         )
 
 
@@ -276,7 +277,9 @@ def read_captured(config: ProcessConfig) -> CapturedFrames:
             "a video shows the frames of one camera",
             "give a file with this camera alone",
         )
-    decoder = None if layout is None else choose_decoder(layout, config.decoder, config.pattern)
+    decoder = (
+        None if layout is None else choose_decoder(layout, config.decoder, config.pattern, config.sequence is not None)
+    )
     captures = find_captures(root, decoder is None or decoder.sequence, cameras)
     if not config.not_mosaic and video is None:
         _refuse_mosaics(captures)
@@ -284,7 +287,7 @@ def read_captured(config: ProcessConfig) -> CapturedFrames:
         layout = recognise_sequence(captures, size, config.sequence, config.cell)
     if layout is None:
         raise ValueError("a pattern is a file or a resolution")
-    decoder = decoder or choose_decoder(layout, config.decoder, config.pattern)
+    decoder = decoder or choose_decoder(layout, config.decoder, config.pattern, config.sequence is not None)
     sentences: Sequence[str] = [] if video is None else video.sentences()
     if not isinstance(layout, GrayCode):
         return CapturedFrames(decoder, captures, CaptureNotes(tuple(sentences), video=video))

@@ -11,7 +11,7 @@ from numpy import ndarray
 from sl_nerfstudio.console import track
 from sl_nerfstudio.object_separation.planes import DecodedFrame, PlaneFinding, Verdict
 from sl_nerfstudio.object_separation.separate import Part, separate
-from sl_nerfstudio.processing.frames import FrameJob, FrameStageResult, FrameWorker, clouds_of
+from sl_nerfstudio.processing.frames import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_clouds
 from sl_nerfstudio.processing.scan_poses import ScanPoses
 from sl_nerfstudio.registration.result import Registration
 from sl_nerfstudio.scan.images import as_grey
@@ -90,6 +90,19 @@ def find_object_only(
 def with_usable_scale(poses: ScanPoses, found: ObjectOnly) -> ScanPoses:
     """The poses with a scale that does not refer to what was left out."""
     return replace(poses, scale=found.usable_scale(poses.scale))
+
+
+def only_object(
+    registration: Registration, results: Sequence[FrameStageResult], found: ObjectOnly
+) -> tuple[Registration, list[FrameStageResult]]:
+    """The registered frames that show the object, and all frames with nothing but the object: what is judged."""
+    empty = np.isin(registration.names, found.empty_frames())
+    clouds = [
+        replace(c, coords=np.where(found.keeps(c.name)[..., None], c.coords, np.float32(np.nan)))
+        if c.name in found.parts else c
+        for c in clouds_of(results)
+    ]  # fmt: skip
+    return replace(registration, registered=registration.registered & ~empty), with_clouds(results, clouds)
 
 
 def _shares(name: str, part: UInt8[ndarray, "h w"], coords: Float[ndarray, "h w 2"]) -> FrameShares:

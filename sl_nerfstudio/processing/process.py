@@ -13,15 +13,29 @@ import numpy as np
 from jaxtyping import Float64, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.console import track
+from sl_nerfstudio.console import phase, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import ShownImage
 from sl_nerfstudio.processing.cache import StageStore, work_folder
+from sl_nerfstudio.processing.captures import describe_faults
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
-from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent, registered_only
+from sl_nerfstudio.processing.consistency import (
+    ConsistentFrames,
+    adjust_consistent,
+    compare_registered,
+    registered_only,
+)
+from sl_nerfstudio.processing.earlier_runs import (
+    WrittenScan,
+    digest_of_captures,
+    note_scan,
+    note_work,
+    with_kept_work,
+    written_scan,
+)
 from sl_nerfstudio.processing.frames import (
     FrameJob,
     FrameStageResult,
@@ -32,10 +46,12 @@ from sl_nerfstudio.processing.frames import (
 )
 from sl_nerfstudio.processing.inputs import GivenPoses, Inputs, read_inputs, refine_camera
 from sl_nerfstudio.processing.object_only import (
+    ObjectOnly,
     Preview,
     find_object_only,
     make_preview,
     object_sentences,
+    only_object,
     with_usable_scale,
 )
 from sl_nerfstudio.processing.projector import (
@@ -48,12 +64,14 @@ from sl_nerfstudio.processing.projector import (
     with_equal_baselines,
     within_stated_doubt,
 )
-from sl_nerfstudio.processing.result import ProcessResult, first_line, left_out, summarise, with_object_only
+from sl_nerfstudio.processing.result import ProcessResult, first_line, left_out, summarise
 from sl_nerfstudio.processing.scan_poses import ScanPoses, find_scan_poses, require_known_frames
+from sl_nerfstudio.processing.turntable import MASKS, agrees_with_itself, moving_part, only_moving
 from sl_nerfstudio.registration.register import choose_projectors, chosen_clouds, register
 from sl_nerfstudio.registration.result import Registration, without_undecided
 from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.review.agreement import SurfaceShares, missing_shares, shared_surface
+from sl_nerfstudio.review.moving_part import MovingPart
 from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.images import read_photograph
 from sl_nerfstudio.scan.write import ScanWriter, encode_json
@@ -194,45 +212,93 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
     in the work folder.
     """
     config.check()
-    with NewFolder(config.output) as folder, work_folder(config.work_folder):
-        return _process(config, folder, make_report, log)
+    own, config = config.work_folder, with_kept_work(config)
+    if config.work_folder != own:
+        log(f"these captures were processed before: {config.work_folder} has what was kept of that")
+    earlier = written_scan(config)
+    renewed = () if earlier is None else tuple(earlier.files)
+    with NewFolder(config.output, renewed) as folder, work_folder(config.work_folder):
+        return _process(config, folder, earlier, make_report, log)
 
 
-def _process(config: ProcessConfig, folder: NewFolder, make_report: MakeReport, log: Log) -> ProcessResult:
-    inputs = read_inputs(config)
-    captures, decoder = inputs.captures, inputs.job.decoder.name
-    log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
-    for sentence in inputs.notes.sentences:
-        log(sentence)
-    frames = _calibrate(config, inputs, make_report, log)
-    wrong = _wrong_intrinsics(inputs, frames, log)
-    given = inputs.given and inputs.given.chosen([result.cloud is not None for result in frames.results])
-    frames, registration = _register(config, inputs, frames, given, log)
-    _require_registered(config, inputs, frames.results, registration, wrong, make_report)
-    frames, consistent = _adjust(config, inputs, frames, registration, log)
+def _process(
+    config: ProcessConfig, folder: NewFolder, earlier: WrittenScan | None, make_report: MakeReport, log: Log
+) -> ProcessResult:
+    with phase("read"):
+        inputs = read_inputs(config)
+        note_work(config)
+        captures, decoder = inputs.captures, inputs.job.decoder.name
+        log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
+        for sentence in (*inputs.notes.sentences, *(f"left out: {fault}" for fault in describe_faults(captures))):
+            log(sentence)
+        digest = digest_of_captures(captures)
+        if earlier is not None:
+            earlier.require_same(digest, config.output)
+            log(f"{config.output} holds an earlier scan of the same captures, which this one replaces")
+    with phase("decode"):
+        frames = _calibrate(config, inputs, make_report, log)
+        wrong = _wrong_intrinsics(inputs, frames, log)
+    with phase("register"):
+        given = _given(inputs, frames.results)
+        frames, registration = _register(config, inputs, frames, given, log)
+        _require_registered(config, inputs, frames.results, registration, wrong, make_report)
+    with phase("adjust"):
+        frames, consistent = _adjust(config, inputs, frames, registration, log)
+        frames, consistent, moving = _register_what_moves(config, inputs, frames, consistent, log)
+        both = consistent.adjusted.median_before_px, consistent.adjusted.median_after_px
+        if np.isfinite(both).all():
+            log("frames agree to {1:.2f} px, {0:.2f} px before".format(*both))
+    with phase("write"):
+        result = _write(config, inputs, frames, consistent, moving, wrong, folder, make_report, log)
+        note_scan(config, folder, digest)
+    return result
+
+
+def _write(
+    config: ProcessConfig,
+    inputs: Inputs,
+    frames: CalibratedFrames,
+    consistent: ConsistentFrames,
+    moving: MovingPart | None,
+    wrong: str,
+    folder: NewFolder,
+    make_report: MakeReport,
+    log: Log,
+) -> ProcessResult:
+    """Judge the adjusted frames, and write the scan with its report."""
+    given = _given(inputs, frames.results)
     registration, adjusted = consistent.registration, within_stated_doubt(consistent.adjusted, frames.job.stated)
     poses = find_scan_poses(clouds_of(frames.results), registration, adjusted, inputs.known, given)
-    shares = _surface_shares(frames.job, frames.results, registration, adjusted.poses)
+    parts, cross, shown, results = None, consistent.cross, registration, frames.results
+    if config.object_only:
+        parts = find_object_only(frames.job, frames.results, registration, poses)
+        log("object only: " + "\n    ".join(object_sentences(parts)))
+        poses = with_usable_scale(poses, parts)
+        shown, results = only_object(registration, frames.results, parts)
+        enough = shown.registered.sum() >= FEWEST_FRAMES
+        cross = compare_registered(clouds_of(results), shown, adjusted, not config.no_adjust) if enough else None
+    shares = () if cross is None else _surface_shares(frames.job, results, shown, adjusted.poses, parts)
     result = summarise(
         config,
-        decoder,
+        inputs.job.decoder.name,
         frames.results,
         registration,
         poses,
-        consistent.cross,
+        cross,
         shares,
         frames.found,
         wrong,
         frames.notes,
+        parts,
+        moving,
     )
-    if config.object_only:
-        parts = find_object_only(frames.job, frames.results, registration, poses)
-        log("object only: " + "\n    ".join(object_sentences(parts)))
-        poses, result = with_usable_scale(poses, parts), with_object_only(result, parts)
-    if result.joint_px is not None:
-        log("joint adjustment: frames agree to {1:.2f} px, {0:.2f} px before".format(*result.joint_px))
     write_scan(folder, frames.job, frames.results, poses, result, make_report)
     return result
+
+
+def _given(inputs: Inputs, results: Sequence[FrameStageResult]) -> GivenPoses | None:
+    """The given poses of the frames that have clouds."""
+    return inputs.given and inputs.given.chosen([result.cloud is not None for result in results])
 
 
 def _calibrate(config: ProcessConfig, inputs: Inputs, make_report: MakeReport, log: Log) -> CalibratedFrames:
@@ -301,28 +367,59 @@ def _adjust(
     return replace(frames, job=job, results=results, found=refined.found), refined.consistent
 
 
+def _register_what_moves(
+    config: ProcessConfig, inputs: Inputs, frames: CalibratedFrames, consistent: ConsistentFrames, log: Log
+) -> tuple[CalibratedFrames, ConsistentFrames, MovingPart | None]:
+    """The frames registered by what moves, where cameras in one place look at something that does, and what that is.
+
+    They stay as they are where nothing moves, and where what moves does not agree with itself.
+    """
+    part = moving_part(frames.results, consistent)
+    if part is None or frames.registration is not None:  # a projector that stands still was placed by what stands still
+        return frames, consistent, part
+    log(
+        f"all cameras are in one place, and {part.share:.0%} of the decoded pixels show something that moves: "
+        f"turntable with a static background. Registering what moves alone; masks of it: {frames.job.work / MASKS}"
+    )
+    rigid = part.rigid and config.rig == "free" and not config.no_adjust
+    config, alone = replace(config, rig="rigid") if rigid else config, only_moving(frames, part, rigid)
+    if len(clouds_of(alone.results)) >= FEWEST_FRAMES:
+        alone, registration = _register(config, inputs, alone, _given(inputs, alone.results), log)
+        if registration.registered.sum() >= FEWEST_FRAMES:
+            alone, found = _adjust(config, inputs, alone, registration, log)
+            if agrees_with_itself(found, alone.results):
+                return alone, found, replace(part, registered=True)
+    log("what moves could not be registered; leave the background out with --masks, or cover it and capture again")
+    return frames, consistent, part
+
+
 def register_clouds(
     clouds: Sequence[FrameCloud], unordered: bool, seed: int, start: Float64[ndarray, "n 4 4"] | None, log: Log
 ) -> tuple[tuple[int, ...], Registration]:
     """Which cloud of every frame, and the registration of these; every pair is tried if the order says nothing."""
     choice = choose_projectors(clouds, not unordered, seed)
-    registration = register(chosen_clouds(clouds, choice.chosen), not unordered, seed, start, log)
+    registration = register(chosen_clouds(clouds, choice.chosen), not unordered, seed, start)
     if not (unordered or registration.ordered):
         log("the frames do not follow each other in the order of capture: --unordered says so")
         before, choice = choice, choose_projectors(clouds, False, seed)  # they were compared with wrong neighbours
         if choice.chosen != before.chosen:
-            registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start, log)
+            registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start)
     return choice.chosen, without_undecided(registration, choice.undecided)
 
 
 def _surface_shares(
-    job: FrameJob, results: Sequence[FrameStageResult], registration: Registration, poses: DevicePoses
+    job: FrameJob,
+    results: Sequence[FrameStageResult],
+    registration: Registration,
+    poses: DevicePoses,
+    parts: ObjectOnly | None,
 ) -> list[SurfaceShares]:
-    """What each registered frame decoded, and should have seen, of the surface that others show."""
+    """What each registered frame decoded, and should have seen, of the surface that others show, or of the object."""
     index, worker = np.flatnonzero(registration.registered), FrameWorker(job)
     frames, clouds = [result for result in results if result.cloud is not None], clouds_of(results)
     cameras, chosen = [job.camera_of(frames[k].frame) for k in index], poses[index]
-    coords, masks = (clouds[k].coords for k in index), (worker.load(frames[k]).mask for k in index)
+    coords, seen = (clouds[k].coords for k in index), (worker.load(frames[k]).mask for k in index)
+    masks = seen if parts is None else (m & parts.keeps(frames[k].name) for k, m in zip(index, seen, strict=True))
     shared = shared_surface(cameras, job.projector, chosen, coords, masks)
     missing = missing_shares(cameras, job.projector, chosen, shared.points, (clouds[k].seen for k in index))
     return [SurfaceShares(*both) for both in zip(shared.decoded, missing, strict=True)]

@@ -22,6 +22,7 @@ from sl_nerfstudio.console import track
 from sl_nerfstudio.decoding.decoder import Decoded
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, DeviceChange
+from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.processing.cache import StageStore
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig, Rig
 from sl_nerfstudio.processing.consistency import ConsistentFrames, adjust_consistent
@@ -29,6 +30,7 @@ from sl_nerfstudio.processing.frames import (
     FrameJob,
     FrameStageResult,
     FrameWorker,
+    capture_sentences,
     clouds_of,
     describe_frame_stage,
     run_frame_stage,
@@ -457,6 +459,9 @@ def contradiction_by_epipolar_geometry(job: FrameJob, results: Sequence[FrameSta
     clouds = firm if len(firm) >= FEWEST_FRAMES else every  # of two, four constraints on three values
     if len(clouds) < FEWEST_FRAMES or len({cloud.camera for cloud in clouds}) > 1:
         return ""
+    clouds = _without_repeats(clouds)
+    if len(clouds) < FEWEST_FRAMES:
+        return ""
     frames = [FrameMatches(c.name, *correspondences_of(c.coords), c.camera) for c in clouds]
     poses = [(c.pose.T_camera_projector[:3, :3], c.pose.T_camera_projector[:3, 3]) for c in clouds]
     evidence = StageStore(job.work).kept(
@@ -468,6 +473,34 @@ def contradiction_by_epipolar_geometry(job: FrameJob, results: Sequence[FrameSta
     stated_px, best_px = evidence.projector.noise_px
     decisive = len(firm) >= FEWEST_FRAMES or best_px < _DECISIVE * stated_px
     return wrong_intrinsics(evidence) if decisive and evidence.contradicts() else ""
+
+
+_REPEATED_PX = 1.0  # pattern pixels, within which a pixel shows in two frames what it showed before
+_REPEATED_SIGMAS = 4.0  # of the noise of both frames, the same
+_SAME_PLACE_DEG = 1.0  # between the relative poses of frames that may repeat each other
+_MOSTLY = 0.5  # share of a frame's correspondences that an earlier frame has already, from which it adds nothing
+
+
+def _without_repeats(clouds: Sequence[FrameCloud]) -> list[FrameCloud]:
+    """The frames that do not mostly show again, at the same pixels, what an earlier one shows.
+
+    A fixed rig before something that stands still measures the same again: the errors of decoder and lens are the same
+    in every frame, and more frames do not make them smaller.
+    """
+    kept: list[FrameCloud] = []
+    for cloud in clouds:
+        uv_camera, uv_projector = correspondences_of(cloud.coords)
+        column, row = uv_camera.astype(np.int64).T
+        R, noise = cloud.pose.T_camera_projector[:3, :3], cloud.pose.residual_px
+        shown = [
+            np.linalg.norm(other.coords[row, column] - uv_projector, axis=1)
+            < max(_REPEATED_PX, _REPEATED_SIGMAS * float(np.hypot(noise, other.pose.residual_px)))
+            for other in kept
+            if angle_deg(R.T @ other.pose.T_camera_projector[:3, :3]) < _SAME_PLACE_DEG
+        ]
+        if not shown or np.any(shown, axis=0).mean() < _MOSTLY:
+            kept.append(cloud)
+    return kept
 
 
 def within_stated_doubt(adjusted: AdjustedFrames, stated: StatedSigma) -> AdjustedFrames:
@@ -594,6 +627,8 @@ def calibrate_frames(config: ProcessConfig, inputs: Inputs, log: Log) -> Calibra
     """Decode and calibrate all frames. Raises UserError where a projector is to be found and cannot be."""
     job, found = inputs.job, None
     results = run_frame_stage(config, job, inputs.captures)
+    for sentence in capture_sentences([(result.name, result.notes) for result in results]):
+        log(sentence)
     if config.finds_projector:
         log(f"decoded {sum(bool(result.key) for result in results)} of {len(results)} frames")
         if config.rig == "static-projector":

@@ -4,6 +4,7 @@ import hashlib
 import json
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from io import BytesIO
 from pathlib import Path
@@ -50,17 +51,19 @@ class DecodedStore:
         content = read_checked(self._path(frame, key))
         if content is None:
             return None
+        with suppress(OSError):
+            self._path(frame, key).touch()  # used: not among the oldest
         try:
             with np.load(BytesIO(content), allow_pickle=False) as stored:
                 coords, mask, pattern = stored["coords"], stored["mask"], stored["pattern"]
-                light = stored.get("light")
+                light, notes = stored.get("light"), tuple(map(str, stored.get("notes", ())))
         except (ValueError, KeyError, EOFError, BadZipFile):
             return None
         if coords.dtype != np.float32 or coords.shape != (*mask.shape, 2) or pattern.shape != mask.shape:
             return None
         if light is not None and light.shape != mask.shape:
             return None
-        return _restored(coords, mask, pattern, light)
+        return _restored(coords, mask, pattern, light, notes)
 
     def save(self, frame: CapturedFrame, key: str, decoded: Decoded) -> Decoded:
         """Store a frame, and return it as `load` will, so that a resumed run gives the same result."""
@@ -68,9 +71,10 @@ class DecodedStore:
         pattern = np.rint(65535 * decoded.pattern).astype(np.uint16)
         light = None if decoded.light is None else decoded.light.astype(np.float16)
         more = {} if light is None else {"light": light}
-        np.savez_compressed(buffer, coords=decoded.coords, mask=decoded.mask, pattern=pattern, **more)
+        notes = np.array(decoded.notes, dtype=np.str_)
+        np.savez_compressed(buffer, coords=decoded.coords, mask=decoded.mask, pattern=pattern, notes=notes, **more)
         write_checked(self._path(frame, key), buffer.getvalue())
-        return _restored(decoded.coords, decoded.mask, pattern, light)
+        return _restored(decoded.coords, decoded.mask, pattern, light, decoded.notes)
 
     def _path(self, frame: CapturedFrame, key: str) -> Path:
         return self.root / DECODED / f"{frame.name}-{key}.npz"
@@ -81,10 +85,11 @@ def _restored(
     mask: Bool[ndarray, "h w"],
     pattern: UInt16[ndarray, "h w"],
     light: Float16[ndarray, "h w"] | None,
+    notes: tuple[str, ...],
 ) -> Decoded:
     """What was decoded, with intensities as exact as they are stored."""
     values = pattern.astype(np.float32) / np.float32(65535)
-    return Decoded(coords, mask, values, None if light is None else light.astype(np.float32))
+    return Decoded(coords, mask, values, None if light is None else light.astype(np.float32), notes)
 
 
 class Manifest:

@@ -13,8 +13,9 @@ from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.calibration.stated import describe_change
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
+from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.processing.config import ProcessConfig
-from sl_nerfstudio.processing.frames import FrameStageResult, clouds_of
+from sl_nerfstudio.processing.frames import FrameStageResult, capture_sentences, clouds_of
 from sl_nerfstudio.processing.inputs import CaptureNotes
 from sl_nerfstudio.processing.object_only import ObjectOnly, object_document
 from sl_nerfstudio.processing.projector import FoundProjector
@@ -31,9 +32,20 @@ from sl_nerfstudio.registration.result import (
     UncertainRotation,
     UndecidedProjector,
 )
+from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind
 from sl_nerfstudio.review.agreement import CrossFrameAgreement, SurfaceShares
-from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, ScanFacts, Verdict, judge_scan, listed
+from sl_nerfstudio.review.moving_part import MovingPart, in_one_place
+from sl_nerfstudio.review.verdict import (
+    FrameFacts,
+    Help,
+    PairFacts,
+    ScanFacts,
+    Verdict,
+    judge_scan,
+    listed,
+    other_places,
+)
 
 # Sentences for what relative pose estimation and registration found out about frames.
 
@@ -214,22 +226,32 @@ class ProcessResult:
         }
 
 
-def with_object_only(result: ProcessResult, found: ObjectOnly) -> ProcessResult:
-    """The result with what was left out; frames that show nothing of the object are not in the scan."""
+def without_empty(frames: Sequence[FrameRecord], found: ObjectOnly) -> tuple[FrameRecord, ...]:
+    """The records; frames that show nothing of the object are not in the scan."""
     reason = (
         "shows nothing of the object\n    cause:  all decoded pixels belong to its surroundings, by --object-only\n"
         "    remedy: capture the object in this view, or leave --object-only out"
     )
     empty = set(found.empty_frames())
-    frames = tuple(
+    return tuple(
         replace(f, in_scan=False, stage="separating", reason=reason) if f.in_scan and f.name in empty else f
-        for f in result.frames
+        for f in frames
     )
-    placed = tuple(group.only_object(found.parts) for group in result.placed)
-    return replace(result, frames=frames, object_only=found, placed=placed)
 
 
-# What to capture again, and why.
+# What helps against each reason of the verdict, and what to capture again, and why.
+
+HELP: dict[Help, str] = {
+    "again": "capture these views again, and run the same sl-process with them",
+    "between": "capture views in between, and run the same sl-process with them",
+    "light": "focus better, with more light from the projector and less from the room, capture it again, and run the "
+    "same sl-process",
+    "nearer": "hold the projector farther from the camera, show parts at other depths, and run the same sl-process",
+    "poses": "calibrate both devices again with sl-calibrate, and run sl-process with the new intrinsics",
+    "adjust": "run the same sl-process without --no-adjust",
+    "intrinsics": "calibrate again with sl-calibrate, or train with ns-train sl-neus --data SCAN "
+    "--pipeline.model.refine-intrinsics True",
+}
 
 _LOW_RATE = 0.6  # decoded share of the pattern
 _SMALL_SHARE = 0.03  # of the image that shows the pattern
@@ -343,31 +365,37 @@ def summarise(
     found: FoundProjector | None = None,
     contradicted: str = "",
     captured: CaptureNotes | None = None,
+    parts: ObjectOnly | None = None,
+    moving: MovingPart | None = None,
 ) -> ProcessResult:
     """The result of a run; without `poses` no frame is in a scan.
 
-    `cross` and `shares` (of what others show) are of the registered frames.
+    `cross` and `shares` (of what others show) are of the frames in the scan: registered, and not empty by `parts`.
+    `moving`: what moves before a static background.
     `found`: the projector, if it was found from the frames. `contradicted`: which intrinsics the epipolar geometry
     contradicts; what the joint adjustment finds is said where this is empty.
     """
-    frames = _with_others([_record(result, registration, poses) for result in results], cross, shares)
+    records = [_record(result, registration, poses) for result in results]
+    frames = _with_others(records if parts is None else without_empty(records, parts), cross, shares)
     edges = () if registration is None else registration.edges
-    records = tuple(EdgeRecord(e.frames, float(e.overlap), float(e.fitness), e.used, e.undecided) for e in edges)
+    pairs = tuple(EdgeRecord(e.frames, float(e.overlap), float(e.fitness), e.used, e.undecided) for e in edges)
     adjusted = None if poses is None else poses.adjusted
     wrong = contradicted or _contradiction(results, adjusted)
+    placed = place_frames(results, registration, poses)
     return ProcessResult(
         config=config,
         decoder=decoder,
         units="arbitrary" if poses is None else poses.units,
         scale_source=poses.scale.source if poses is not None and poses.scale.known else "",
         frames=frames,
-        edges=records,
+        edges=pairs,
         remarks=(
             *([wrong] if wrong else []),
             *([found.doubt] if found and found.doubt else []),
             *(map(uncertainty_sentence, registration.uncertainties) if registration else ()),
+            *capture_sentences([(result.name, result.notes) for result in results]),
         ),
-        recapture=what_to_recapture(frames, records, not config.unordered),
+        recapture=what_to_recapture(frames, pairs, not config.unordered),
         joint_px=None if adjusted is None else _both_known(adjusted.median_before_px, adjusted.median_after_px),
         cross_px=None if cross is None else _both_known(cross.px_median, cross.px_p95),
         verdict=judge_scan(
@@ -375,20 +403,26 @@ def summarise(
                 frames,
                 tuple(
                     PairFacts(e.frames, e.used, support_of(e.overlap, e.fitness))
-                    for e in records
+                    for e in pairs
                     if e.used or not e.undecided
                 ),
                 cross,
                 bool(wrong),
                 () if registration is None else registration.turns_deg,
                 registration is not None and registration.by_order,
+                None if moving is None else moving.share,
+                moving is not None and moving.registered,
+                ()
+                if adjusted is None
+                else other_places(adjusted.modes, [r.name for r in results if r.cloud is not None]),
                 adjusted=not config.no_adjust,
             )
-        ),
+        ).with_help(HELP),
         projector=found,
         contradiction=wrong,
+        object_only=parts,
         captured=captured,
-        placed=place_frames(results, registration, poses),
+        placed=placed if parts is None else tuple(group.only_object(parts.parts) for group in placed),
         versions={"sl_nerfstudio": __version__, **{p: importlib.metadata.version(p) for p in ("numpy", "torch")}},
     )
 
@@ -417,9 +451,19 @@ def _with_others(
 def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames | None) -> str:
     """Which intrinsics the captures contradict; "" if none."""
     clouds = clouds_of(results)
-    if adjusted is None or not clouds:
+    if adjusted is None or not clouds or repeat_each_other(adjusted.poses, clouds):
         return ""
     return contradiction(adjusted.intrinsics, [cloud.camera for cloud in clouds], clouds[0].projector)
+
+
+def repeat_each_other(poses: DevicePoses, clouds: Sequence[FrameCloud]) -> bool:
+    """Whether both devices stood still in all frames: their errors repeat, and say nothing more than those of one."""
+    placed = np.isfinite(poses.T_world_camera).all((1, 2))
+    chosen = poses[placed]
+    depths = [-float(np.median(cloud.points[:, 2])) for cloud in clouds]
+    depth = float(np.median(depths)) * float(np.median(chosen.baseline)) if len(chosen) else 0.0
+    projectors = DevicePoses(chosen.T_world_projector, chosen.T_world_camera)
+    return in_one_place(chosen, depth) and in_one_place(projectors, depth)
 
 
 def _both_known(before: float, after: float) -> tuple[float, float] | None:

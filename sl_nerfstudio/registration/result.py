@@ -12,6 +12,8 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.relative_pose.epipolar import directions
 from sl_nerfstudio.relative_pose.intrinsics import camera_depth
+from sl_nerfstudio.scan.lengths import METRES, parse_length
+from sl_nerfstudio.scan.types import UNITS
 
 
 @dataclass(frozen=True)
@@ -167,11 +169,11 @@ def without_undecided(registration: Registration, undecided: Sequence[UndecidedP
 
 PICKING_RADIUS_PX = 3.0  # around a picked pixel, of whose depths the median is taken
 LEAST_METRES, MOST_METRES = 1e-9, 1e9  # of a known length: nothing that a camera sees is smaller
-_METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6}
+_METRIC = "mm"  # unit of a scan whose length was typed in inches
 _NUMBER = r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
-_PIXEL = rf"frame (\S+) \( *{_NUMBER} *, *{_NUMBER} *\)"
-_BASELINE = re.compile(rf"baseline of frame (\S+) *= *{_NUMBER} *(\w+)")
-_BAR = re.compile(rf"distance (?:between|from) {_PIXEL} (?:and|to) {_PIXEL} *= *{_NUMBER} *(\w+)")
+_PIXEL = rf"frame (.+?) ?\( *{_NUMBER} *, *{_NUMBER} *\)"
+_BASELINE = re.compile(r"baseline of frame (.+?) *= *(.*)")
+_BAR = re.compile(rf"distance (?:between|from) {_PIXEL} (?:and|to) {_PIXEL} *= *(.*)")
 
 
 @dataclass(frozen=True)
@@ -179,7 +181,7 @@ class KnownLength:
     """A length in metres and what it belongs to: a baseline, or the distance between two picked pixels."""
 
     metres: float
-    unit: str
+    unit: str  # of the scan that gets its scale from it
     frames: tuple[str, ...]  # number or name of the frame, or of the two frames
     pixels: tuple[tuple[float, float], ...] = ()  # picked in them, (x, y); the centre of the first pixel is (.5, .5)
 
@@ -198,23 +200,18 @@ def parse_known_length(text: str) -> KnownLength:
     """
     text = " ".join(text.split())
     if baseline := _BASELINE.fullmatch(text):
-        frames, pixels, length, unit = (baseline[1],), (), float(baseline[2]), baseline[3]
+        frames, pixels, typed = (baseline[1],), (), baseline[2]
     elif bar := _BAR.fullmatch(text):
-        frames, length, unit = (bar[1], bar[4]), float(bar[7]), bar[8]
+        frames, typed = (bar[1], bar[4]), bar[7]
         pixels = ((float(bar[2]), float(bar[3])), (float(bar[5]), float(bar[6])))
     else:
         raise UserError(
-            f'known length "{text}" is not understood\n    remedy: write "baseline of frame 0 = 85 mm" or '
+            f'--known-length "{text}": is not understood\n    cause:  it does not say what is so long\n'
+            '    remedy: write "baseline of frame 0 = 85 mm" or '
             '"distance between frame 3 (410.5, 200) and frame 7 (35, 80) = 50 mm" (pixels x, y)'
         )
-    if unit not in _METRES:
-        raise UserError(f'known length "{text}": unit "{unit}" is none of {", ".join(_METRES)}')
-    metres = length * _METRES[unit]
-    if not LEAST_METRES <= metres <= MOST_METRES:
-        least, most = LEAST_METRES / _METRES[unit], MOST_METRES / _METRES[unit]
-        problem = "above zero" if length <= 0 else f"between {least:g} and {most:g} {unit}"
-        raise UserError(f'known length "{text}": a length must be {problem}')
-    return KnownLength(metres, unit, frames, pixels)
+    length = parse_length(typed, f'--known-length "{text}"', LEAST_METRES, MOST_METRES)
+    return KnownLength(length.metres, length.unit if length.unit in UNITS else _METRIC, frames, pixels)
 
 
 def scale_to(
@@ -224,7 +221,7 @@ def scale_to(
     T_world_camera: Float64[ndarray, "n 4 4"],
     T_world_projector: Float64[ndarray, "n 4 4"],
 ) -> float:
-    """Factor by which all positions must be multiplied for the length to be true, in `unit` ("m", "cm", "mm", "um").
+    """Factor by which all positions must be multiplied for the length to be true, in `unit` (of `METRES`).
 
     Raises UserError where a frame does not exist or was not registered, or where nothing was decoded at a pixel.
     """
@@ -246,7 +243,7 @@ def scale_to(
         found = float(np.linalg.norm(T_world_camera[k, :3, 3] - T_world_projector[k, :3, 3]))
     if found <= 0:
         raise UserError(f"{known.source}: the two ends are the same point\n    remedy: pick two different places")
-    return known.metres / _METRES[unit] / found
+    return known.metres / METRES[unit] / found
 
 
 def is_index(frame: str, count: int) -> bool:

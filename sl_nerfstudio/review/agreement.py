@@ -318,7 +318,7 @@ _EDGE = 2.0  # per cent of the points on each side that may lie outside the obje
 
 def compare_scan_frames(scan: Scan, poses: DevicePoses, sigma: Sequence[PoseSigma | None]) -> CrossFrameAgreement:
     """Compare the frames of a scan: `compare_frames` with coordinates from its files, where the masks allow them."""
-    images = (np.where(f.read_mask()[..., None], f.read_coords(), np.float32(np.nan)) for f in scan.frames)
+    images = (frame.read_masked_coords() for frame in scan.frames)
     return compare_frames([f.camera for f in scan.frames], scan.projector, poses, images, sigma)
 
 

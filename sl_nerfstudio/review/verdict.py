@@ -5,12 +5,13 @@ of pixels and of frames, and degrees; no lengths.
 """
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
+from sl_nerfstudio.bundle_adjustment.modes import Mode
 from sl_nerfstudio.bundle_adjustment.parameters import USUAL_FRAME_ROTATION_DEG
 from sl_nerfstudio.calibration.board import BoardCalibration
 from sl_nerfstudio.geometry.lie import DevicePoses, angle_deg
@@ -24,10 +25,17 @@ from sl_nerfstudio.review.agreement import (
     bridges,
 )
 from sl_nerfstudio.scan import Scan
+from sl_nerfstudio.scan.check_mixed_poses import SUSPECT_SIGMAS
 
 Band = Literal["good", "acceptable", "poor"]
 BANDS: tuple[Band, ...] = ("good", "acceptable", "poor")
 _LISTED = 6  # names in a sentence
+
+Help = Literal["", "again", "between", "light", "nearer", "poses", "adjust", "intrinsics", "boards"]
+"""What helps; each command says it in its own words. "again": other captures of these views; "between": captures that
+connect frames; "light": more of the pattern decoded; "nearer": captures whose projector is better determined;
+"poses": better poses, or a true statement of how rough they are; "adjust": the joint
+adjustment; "intrinsics": a calibration; "boards": more poses of the board. "": the sentence says it."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +44,7 @@ class Reason:
 
     band: Band
     sentence: str  # names frames and figures
+    help: Help = ""
 
 
 @dataclass(frozen=True)
@@ -44,12 +53,20 @@ class Verdict:
 
     band: Band
     reasons: tuple[str, ...]  # the worst first; empty for a good scan
+    helps: tuple[Help, ...] = ()  # for each reason, what helps
+
+    def with_help(self, words: Mapping[Help, str]) -> "Verdict":
+        """Let each reason end with what helps, in the words of a command; kinds without words add nothing."""
+        both = zip(self.reasons, self.helps, strict=True)
+        return replace(self, reasons=tuple("; ".join(filter(None, [one, words.get(help)])) for one, help in both))
 
 
 def worst(reasons: Iterable[Reason]) -> Verdict:
     """The verdict that some reasons lead to; good if there are none."""
     ordered = sorted((r for r in reasons if r.band != "good"), key=lambda r: -BANDS.index(r.band))
-    return Verdict(ordered[0].band if ordered else "good", tuple(r.sentence for r in ordered))
+    return Verdict(
+        ordered[0].band if ordered else "good", tuple(r.sentence for r in ordered), tuple(r.help for r in ordered)
+    )
 
 
 def listed(names: Sequence[str], most: int = _LISTED) -> str:
@@ -98,9 +115,7 @@ def describe_departed(found: Sequence[DepartedFrame]) -> str:
 
 def departed_reasons(found: Sequence[DepartedFrame]) -> list[Reason]:
     """A result that excludes what it started from is not good, whichever of them is wrong."""
-    return [
-        Reason("acceptable", f"{describe_departed([one])}: far from its starting pose; look at it") for one in found
-    ]
+    return [Reason("acceptable", f"{describe_departed([one])}: far from its starting pose", "again") for one in found]
 
 
 # The verdict on a calibration from boards, and why. Limits of a good calibration, and of an acceptable one:
@@ -151,19 +166,34 @@ def _reasons(found: BoardCalibration) -> Iterator[Reason]:
         name = DEVICES[k]
         focal, centre = sigma.focal() / device.fl_x, sigma.centre() / device.fl_x
         if (band := _band(focal, _FOCAL)) != "good":
-            yield Reason(band, f"the focal length of the {name} is uncertain by {focal:.2%} (1 sigma){because}")
+            yield Reason(
+                band, f"the focal length of the {name} is uncertain by {focal:.2%} (1 sigma){because}", "boards"
+            )
         if (band := _band(centre, _CENTRE)) != "good":
             yield Reason(
-                band, f"the principal point of the {name} is uncertain by {sigma.centre():.0f} px (1 sigma){because}"
+                band,
+                f"the principal point of the {name} is uncertain by {sigma.centre():.0f} px (1 sigma){because}",
+                "boards",
             )
         if (band := _band(found.rms_px[k], _RMS_PX)) != "good":
-            yield Reason(band, f"corners are {found.rms_px[k]:.2f} px (RMS) from where the {name} should see them")
+            yield Reason(
+                band, f"corners are {found.rms_px[k]:.2f} px (RMS) from where the {name} should see them", "boards"
+            )
         if found.left_out.error_px[k] > _GOOD_PREDICTION * max(found.rms_px[k], found.adjusted.sigma_px[k]):
             yield Reason(
                 "acceptable",
                 f"corners of left-out poses are predicted to {found.left_out.error_px[k]:.2f} px in the {name}, "
-                f"fitted ones to {found.rms_px[k]:.2f} px: more poses would help",
+                f"fitted ones to {found.rms_px[k]:.2f} px",
+                "boards",
             )
+    if found.misfit is not None:
+        yield Reason(
+            "acceptable",
+            "the model of the camera's lens does not fit: with their distance from the middle of the image, corners "
+            f"lie up to {-found.misfit.inwards_px:.2g} px inside and {found.misfit.outwards_px:.2g} px outside of "
+            "where it puts them. The focal length may be wrong by more than its sigma. Wide-angle and fisheye lenses "
+            "have no model beyond k1, k2: use a longer lens, or crop photographs and captures alike to the middle",
+        )
 
 
 def _band(value: float, limits: tuple[float, float]) -> Band:
@@ -186,6 +216,10 @@ class FrameFacts:
     shared_decoded: float | None = None  # of the surface that other frames show, where this one sees the pattern
     missing_share: float | None = None  # of the surface that other frames show in its sight: where it saw no pattern
     own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's own projector
+    rays_px: float | None = (
+        None  # how far its rays miss each other under a pose that states its uncertainty, pattern px
+    )
+    stated_px: float | None = None  # of this, what the stated uncertainty explains, 1 sigma
     degeneracies: tuple[str, ...] = ()  # why the frame itself determines the pose of its projector only weakly
 
 
@@ -199,6 +233,28 @@ class PairFacts:
 
 
 @dataclass(frozen=True)
+class OtherPlace:
+    """Frames that may stand elsewhere as one: what was seen leaves it possible."""
+
+    frames: tuple[str, ...]
+    angle_deg: float  # by which they would be turned against the others
+    odds: float  # of that place against the one in the scan
+
+    def sentence(self) -> str:
+        """Name the frames, how far the other place is, and how likely."""
+        likely = f"1 in {1 / self.odds + 1:.0f}" if self.odds < 1 else "as likely"
+        return f"{listed(self.frames)}: may be turned by {self.angle_deg:.0f} degrees against the others ({likely})"
+
+
+def other_places(modes: Sequence[Mode], names: Sequence[str]) -> tuple[OtherPlace, ...]:
+    """Other poses that an adjustment leaves possible; `names` of all its frames."""
+    return tuple(
+        OtherPlace(tuple(names[k] for k in mode.frames), mode.angle_deg, math.exp(min(mode.log_odds, 0.0)))
+        for mode in modes
+    )
+
+
+@dataclass(frozen=True)
 class ScanFacts:
     """All captures of a scan, in order."""
 
@@ -208,6 +264,9 @@ class ScanFacts:
     wrong_intrinsics: bool = False  # the captures contradict the stated intrinsics
     turns_deg: tuple[float, ...] = ()  # after which the surface looks the same, so that frames may be turned by them
     by_order: bool = False  # frames fit at several sides, and the order of capture decided
+    moving_share: float | None = None  # of the decoded pixels: what moves before cameras that stand still
+    moving_registered: bool = False  # only this is in the scan
+    other_places: tuple[OtherPlace, ...] = ()  # of frames in the scan
     adjusted: bool = True  # False: sl-process was told to leave the poses as registration found them
 
     @property
@@ -228,6 +287,7 @@ _LEAST_OWN_SHARE = 0.5  # of a frame's decoded pixels, those that must agree wit
 _GOOD_SIGMA_DEG = 1.0  # standard deviation of a frame's rotation up to which a scan is good, and beyond which it is
 # acceptable: edges of the object may be smeared by a hundredth of its size
 _LARGEST_SIGMA_DEG = 3.0  # beyond which the frame may well be wrong and the scan is poor
+_ACCEPTABLE_ODDS, _POOR_ODDS = 1e-3, 5e-2  # of another place of frames, from which a scan is not good, and is poor
 _LEAST_SEEN = 0.15  # share of a frame's points that other frames must be able to judge, as registration demands
 _LEAST_SHARE = 0.85  # of the judged points, those that must agree in an acceptable scan, in every frame and over all
 
@@ -240,10 +300,15 @@ def judge_scan(facts: ScanFacts) -> Verdict:
 def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
     """Everything that keeps the scan from being good."""
     if len(facts.in_scan) < 2:
-        yield Reason("poor", f"only {len(facts.in_scan)} of {len(facts.frames)} frames could be used")
+        yield Reason("poor", f"only {len(facts.in_scan)} of {len(facts.frames)} frames could be used", "again")
         return
+    if facts.moving_share is not None:
+        yield _turntable(facts.moving_share, facts.moving_registered)
     yield from _left_out(facts)
     yield from _undecided(facts)
+    for place in facts.other_places:
+        if place.odds > _ACCEPTABLE_ODDS:
+            yield Reason("poor" if place.odds > _POOR_ODDS else "acceptable", place.sentence(), "between")
     if facts.by_order:
         yield _placed_by_order(facts.turns_deg)
     elif facts.turns_deg:
@@ -252,18 +317,36 @@ def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
         yield from _weak_connections(facts)
     if facts.cross is not None:
         yield from cross_reasons([f.name for f in facts.in_scan], facts.cross)
+    yield from _starting_poses(facts)
     yield from _decoding(facts)
     yield from _missing(facts)
     degenerate = [f.name for f in facts.in_scan if f.degeneracies]
     if len(degenerate) > _MOST_FRAMES * len(facts.in_scan):
-        yield Reason("acceptable", f"the pose of the projector is weakly determined in {listed(degenerate)}")
+        yield Reason("acceptable", f"the pose of the projector is weakly determined in {listed(degenerate)}", "nearer")
     if not facts.adjusted:
         yield Reason(
             "acceptable", "the poses are those of the registration alone (--no-adjust); frames were compared within "
-            "its uncertainty only",
+            "its uncertainty only", "adjust",
         )  # fmt: skip
     if facts.wrong_intrinsics:
-        yield Reason("acceptable", "the captures contradict the stated intrinsics")
+        yield Reason("acceptable", "the captures contradict the stated intrinsics", "intrinsics")
+
+
+def _turntable(share: float, registered: bool) -> Reason:
+    """Say that what turns was taken before something that stands still."""
+    if registered:
+        return Reason(
+            "acceptable",
+            f"turntable with a static background: only what moves, {share:.0%} of the decoded pixels, is in the scan. "
+            "See in the report that it is all of the object; to be certain, cover the background, or leave it out with "
+            "sl-process --masks",
+        )
+    return Reason(
+        "poor",
+        f"all cameras are in one place while {share:.0%} of the decoded pixels show something that moves: turntable "
+        "with a static background. The scan holds the background, and the object in several positions: leave the "
+        "background out with sl-process --masks, or cover it and capture again",
+    )
 
 
 def _left_out(facts: ScanFacts) -> Iterator[Reason]:
@@ -277,10 +360,11 @@ def _left_out(facts: ScanFacts) -> Iterator[Reason]:
             band,
             f"{listed(names)}: {'form a group of their own' if len(names) > 1 else 'stands alone'}; the connection to "
             "the other frames is not certain, so they are not in the scan",
+            "between",
         )
     single = [f.name for f in lost if f.component not in apart]
     if single:
-        yield Reason(band, f"{len(single)} of {len(facts.frames)} frames were left out: {listed(single)}")
+        yield Reason(band, f"{len(single)} of {len(facts.frames)} frames were left out: {listed(single)}", "again")
 
 
 def _undecided(facts: ScanFacts) -> Iterator[Reason]:
@@ -288,14 +372,14 @@ def _undecided(facts: ScanFacts) -> Iterator[Reason]:
     good, largest = _GOOD_SIGMA_DEG, _LARGEST_SIGMA_DEG
     lost = [f for f in facts.in_scan if (f.sigma_rotation_deg or 0.0) > largest]
     if lost:
-        yield Reason("poor", _known_only(lost, largest))
+        yield Reason("poor", _known_only(lost, largest), "between")
     loose = [f for f in facts.in_scan if good < (f.sigma_rotation_deg or 0.0) <= largest]
     if loose and facts.adjusted:  # without the adjustment, it is so in every frame of any scan
-        yield Reason("acceptable", _known_only(loose, good))
+        yield Reason("acceptable", _known_only(loose, good), "between")
     names = [f.name for f in facts.in_scan if f.undecided and f not in lost + loose]
     if names:
         band = _share_band(len(names), len(facts.in_scan))
-        yield Reason(band, f"{listed(names)}: the pose is undecided; along the surface, others fit as well")
+        yield Reason(band, f"{listed(names)}: the pose is undecided; along the surface, others fit as well", "between")
 
 
 def _known_only(frames: Sequence[FrameFacts], limit_deg: float) -> str:
@@ -349,6 +433,7 @@ def _weak_connections(facts: ScanFacts) -> Iterator[Reason]:
         yield Reason(
             _share_band(len(doubtful), len(names)),
             f"{listed(doubtful)}: most pairs with other frames contradict the pose found",
+            "again",
         )
     index = {name: k for k, name in enumerate(names)}
     if len(names) < 3:
@@ -358,6 +443,7 @@ def _weak_connections(facts: ScanFacts) -> Iterator[Reason]:
             "acceptable",
             f"only the pair {names[a]} and {names[b]} connects {listed([names[k] for k in part])} to the other frames; "
             "no other pair confirms it",
+            "between",
         )
 
 
@@ -374,6 +460,7 @@ def cross_reasons(names: Sequence[str], cross: CrossFrameAgreement) -> Iterator[
             _share_band(len(alone), len(names)),
             f"{listed(alone)}: no other frame shows enough of the same surface (at least {_LEAST_SEEN:.0%}) to "
             "confirm the pose",
+            "between",
         )
     if not cross.pairs:
         return
@@ -383,12 +470,41 @@ def cross_reasons(names: Sequence[str], cross: CrossFrameAgreement) -> Iterator[
     for k, (name, frame) in enumerate(zip(names, cross.frames, strict=True)):
         band = frame_band(frame)
         if band != "good" and k not in named:
-            yield Reason(band, _frame_sentence(name, frame, cross, band))
+            yield Reason(band, _frame_sentence(name, frame, cross, band), "again")
     if cross.share < GOOD_SHARE:
         yield Reason(
             "poor" if cross.share < _LEAST_SHARE else "acceptable",
             f"of all points that two frames saw, {cross.share:.0%} agree: 95 % lie within {cross.px_p95:.2g} px, the "
             f"noise is {cross.noise_px:.2g} px",
+            "poses",
+        )
+
+
+def _starting_poses(facts: ScanFacts) -> Iterator[Reason]:
+    """Relative poses that the coordinates of their own frames exclude, by what is stated of them."""
+    known = [(f.rays_px / f.stated_px, f) for f in facts.in_scan if f.rays_px is not None and f.stated_px]
+    if not known:
+        return
+    if _median([excess for excess, _ in known]) > SUSPECT_SIGMAS:
+        rays, stated = (_median([value or 0.0 for value in values]) for values in zip(
+            *((f.rays_px, f.stated_px) for _, f in known), strict=True
+        ))  # fmt: skip
+        yield Reason(
+            "poor",
+            f"the rays of camera and projector miss each other by {rays:.2g} px (median), the stated uncertainty of "
+            f"the poses explains {stated:.2g} px: poses or intrinsics are of another calibration, or sl_pose_sigma is "
+            "too small. Without sl_pose_sigma the training searches farther from these poses; sl-process finds "
+            "poses from the photographs",
+        )
+        return
+    bad = [(excess, f) for excess, f in known if excess > _MOST_SIGMA]
+    if bad:
+        frame = max(bad, key=lambda one: one[0])[1]
+        yield Reason(
+            _share_band(len(bad), len(facts.in_scan)),
+            f"{listed([f.name for _, f in bad])}: the rays of camera and projector miss each other by far more than "
+            f"the stated uncertainty of the poses explains ({frame.name}: {frame.rays_px:.2g} px, stated "
+            f"{frame.stated_px:.2g} px); give these frames another pose of the projector, or leave them out",
         )
 
 
@@ -407,6 +523,7 @@ def _contradicting_groups(
             "poor",
             f"the frames contradict each other: at most {len(groups[0])} of {len(names)} agree, and 95 % of the points "
             f"that two frames saw lie only within {cross.px_p95:.2g} px",
+            "poses",
         )
         return
     for group in groups[1:]:
@@ -416,16 +533,18 @@ def _contradicting_groups(
                 "poor",
                 f"{listed([names[k] for k in group])}: no surface in common with the other frames, so nothing confirms "
                 "how the two parts lie to each other",
+                "between",
             )
             continue
         if len(group) == 1:
-            yield Reason("poor", _frame_sentence(names[group[0]], cross.frames[group[0]], cross, "poor"))
+            yield Reason("poor", _frame_sentence(names[group[0]], cross.frames[group[0]], cross, "poor"), "again")
             continue
         yield Reason(
             "poor",
             f"{listed([names[k] for k in group])}: agree with each other and contradict the other frames: 95 % of the "
             f"points that both saw lie only within {_median(between):.2g} px (in the whole scan: noise "
             f"{cross.noise_px:.2g} px)",
+            "again",
         )
 
 
@@ -453,7 +572,8 @@ def _decoding(facts: ScanFacts) -> Iterator[Reason]:
             share, name = min(weak)
             others = f"; also little in {listed([n for _, n in weak if n != name])}" if len(weak) > 1 else ""
             band = _share_band(len(weak), len(facts.in_scan))
-            yield Reason(band, f"{name}: only {share:.0%} {words} (at least {least:.0%}){others}")
+            sentence = f"{name}: only {share:.0%} {words} (at least {least:.0%}){others}"
+            yield Reason(band, sentence, "again" if words == own else "light")
 
 
 def _missing(facts: ScanFacts) -> Iterator[Reason]:
@@ -466,6 +586,7 @@ def _missing(facts: ScanFacts) -> Iterator[Reason]:
             f"{listed([name for _, name in found])}: saw nothing of the pattern where other frames show a surface in "
             f"the sight of both devices ({worst_share:.0%} of it in the worst of them; at most {_MOST_MISSING:.0%}): "
             "something cast a shadow, or frames are at the wrong place",
+            "again",
         )
 
 

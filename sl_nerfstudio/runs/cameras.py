@@ -260,7 +260,7 @@ def require_possible(frames: PosedFrames, root: Path) -> None:
     if not any(frames.placed):
         raise UserError(
             "--cameras colmap: no frame agrees with the others, so there is no pose to write\n"
-            "    remedy: check the scan with sl-check, or leave --cameras out"
+            "    remedy: find the poses anew with sl-process, or leave --cameras out"
         )
     projector = frames.projectors[0].device
     if projector.model == "DOE" and any((projector.k1, projector.k2, projector.p1, projector.p2)):

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, SelfCalibration
-from sl_nerfstudio.console import track
+from sl_nerfstudio.console import phase, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
@@ -131,10 +131,11 @@ _PACKAGES = ("sl-nerfstudio", "nerfstudio", "torch", "numpy", "scipy", "numba", 
 _SETTINGS = ("method_name", "max_num_iterations", "schedule_iterations", "mixed_precision", "machine", "optimizers")
 
 
-def training_record(run: TrainedRun) -> dict[str, Any]:
-    """`settings` (nested), `versions` (of the export, by package), `curves` (lists by name, NaN as None), `intrinsics`.
+def training_record(run: TrainedRun, settings: ExportSettings) -> dict[str, Any]:
+    """`settings` (nested), `versions` (of the export, by package), `curves` (lists by name, NaN as None), and others.
 
-    The last says how intrinsics were changed, and how well they agree with the captures.
+    `intrinsics` says how these were changed, and how well they agree with the captures; `commands` go on from here: to
+    `train` the run up to its recommended length, to `export` it with finer cells.
     """
     return {
         "settings": {"step": run.step, **run_settings(run.config)},
@@ -149,7 +150,22 @@ def training_record(run: TrainedRun) -> dict[str, Any]:
             "change": plain(run.model.scan.intrinsics_change),
             "self_calibration": _self_calibration(run.model.self_calibration()),
         },
+        "commands": _commands(run, settings),
     }
+
+
+def _commands(run: TrainedRun, settings: ExportSettings) -> dict[str, list[str]]:
+    """As words, with absolute paths."""
+    config, method = run.config, run.config.method_name
+    folder: Path = config.get_base_dir().absolute()
+    steps = max(RECOMMENDED_STEPS.get(method, 0), getattr(config, "schedule_iterations", None) or 0) - run.step - 1
+    place = ("--output-dir", config.output_dir.absolute(), "--experiment-name", config.experiment_name)
+    train = ("ns-train", method, "--data", run.model.scan.root.absolute(), "--load-dir", folder / "nerfstudio_models",
+             *place, "--timestamp", config.timestamp, "--max-num-iterations", max(steps, 1))  # fmt: skip
+    poses = () if settings.pose_folder is None else ("--poses", settings.pose_folder.absolute())
+    export = ("sl-export", "--load-config", folder / "config.yml", "--output", settings.mesh.absolute(), *poses,
+              "--resolution", 2 * settings.resolution, "--overwrite")  # fmt: skip
+    return {"train": list(map(str, train)), "export": list(map(str, export))}
 
 
 def _self_calibration(found: SelfCalibration | None) -> dict[str, Any] | None:
@@ -382,7 +398,8 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     surface = build_surface(model, settings)
     mesh, scan, poses = surface.marked.mesh, model.scan, model.poses()
     joint = model.joint_covariance()
-    quality = vertex_uncertainty(mesh, scan, poses, joint, model.cell)
+    with phase("uncertainty of the vertices"):
+        quality = vertex_uncertainty(mesh, scan, poses, joint, model.cell)
     colours = vertex_colours(mesh, scan, poses)
     invented = quality.views == 0 if settings.keep_unobserved else surface.marked.invented
     properties = VertexProperties(quality, invented, None if colours is None else colours.rgb)
@@ -393,17 +410,19 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
         write_device_files(settings, model, mesh, properties.colour)
     whole, decimated, textured = mesh, None, None
     if settings.target_faces is not None:
-        decimated = decimate(mesh, settings.target_faces)
+        with phase("fewer triangles"):
+            decimated = decimate(mesh, settings.target_faces)
         mesh, properties = decimated.mesh, properties.chosen(decimated.nearest).moved(decimated.distance)
     if settings.watertight:
         _require_closed(mesh, settings)
     if settings.texture is not None:
-        textured = surface_texture(mesh, settings.texture, whole, scan, poses)
+        with phase("laying the mesh out flat"):
+            textured = surface_texture(mesh, settings.texture, whole, scan, poses)
     write_mesh(settings.mesh, mesh, properties, scan.units, None if textured is None else textured.texture)
     if settings.pose_folder is not None:
         _write_poses(settings.pose_folder / TRANSFORMS, model)
         write_covariance(settings.pose_folder, scan, joint)
-        write_atomic(settings.pose_folder / "training.json", encode_json(training_record(run)))
+        write_atomic(settings.pose_folder / "training.json", encode_json(training_record(run, settings)))
     seconds = time.perf_counter() - start - surface.extraction_seconds
     refined = poses_refined(model)
     return Exported(

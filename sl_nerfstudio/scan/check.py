@@ -16,13 +16,8 @@ from sl_nerfstudio.console import track
 from sl_nerfstudio.errors import Fault, ScanError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, unproject
 from sl_nerfstudio.parallel import results, threads
-from sl_nerfstudio.scan.check_conventions import (
-    Correspondences,
-    GeometricFit,
-    convention_problems,
-    fit_geometry,
-    sample_pixels,
-)
+from sl_nerfstudio.scan.check_conventions import convention_problems
+from sl_nerfstudio.scan.check_geometry import Correspondences, GeometricFit, fit_geometry, sample_pixels
 from sl_nerfstudio.scan.check_images import (
     CLEAR,
     ImageMatch,
@@ -413,7 +408,13 @@ def _correspondences(
         return None
     uv_camera, uv_projector = sample_pixels(coords, where)
     return Correspondences(
-        frame.name, frame.camera, frame.T_world_camera, frame.T_world_projector, uv_camera, uv_projector
+        frame.name,
+        frame.camera,
+        frame.T_world_camera,
+        frame.T_world_projector,
+        uv_camera,
+        uv_projector,
+        frame.pose_sigma,
     )
 
 

@@ -11,85 +11,19 @@ from itertools import product
 from typing import Literal
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Float32, Float64
+from jaxtyping import Float, Float64
 from numpy import ndarray
-from scipy.spatial import KDTree
-from torch import Tensor
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics
-from sl_nerfstudio.geometry.numerics import evenly_spaced
-from sl_nerfstudio.geometry.triangulation import epipolar_residual, triangulate
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.scan.check_geometry import Correspondences, GeometricFit, OtherClouds, fit_geometry
+from sl_nerfstudio.scan.check_mixed_poses import SUSPECT, SUSPECT_SIGMAS, copied_poses, is_suspect, mixed_poses
 from sl_nerfstudio.scan.document import Problem
-
-# A few hundred correspondences of each frame, kept while the frames are read one by one.
-
-SAMPLES = 400  # per frame; enough for a median, few enough to try dozens of interpretations
-
-
-@dataclass(frozen=True)
-class Correspondences:
-    """Camera pixels and pattern coordinates of one frame, with everything needed to triangulate them."""
-
-    name: str
-    camera: Device
-    T_world_camera: Float64[ndarray, "4 4"]
-    T_world_projector: Float64[ndarray, "4 4"]
-    uv_camera: Float64[ndarray, "n 2"]
-    uv_projector: Float64[ndarray, "n 2"]
-
-
-def sample_pixels(
-    coords: Float32[ndarray, "h w 2"], where: Bool[ndarray, "h w"]
-) -> tuple[Float64[ndarray, "n 2"], Float64[ndarray, "n 2"]]:
-    """Pixel centres and coordinates at SAMPLES pixels spread evenly over `where` (some twice if it has fewer)."""
-    flat = np.flatnonzero(where)
-    chosen = flat[evenly_spaced(len(flat), SAMPLES)]
-    rows, columns = np.divmod(chosen, where.shape[1])
-    return np.stack([columns, rows], -1) + 0.5, coords.reshape(-1, 2)[chosen].astype(np.float64)
-
-
-# How far a frame's points are from those of all other frames, without a search tree for every frame.
-
-_FEWEST_POINTS = 10
-
-
-class OtherClouds:
-    """Point clouds of frames, to be searched without the cloud of one frame.
-
-    Two numbers differ in at least one binary digit. So the clouds whose number differs from k are those that differ
-    in the first digit, in the second, and so on: two trees for each digit serve all frames.
-    """
-
-    def __init__(self, clouds: Sequence[Float64[ndarray, "_ 3"]]) -> None:
-        """`clouds` are numbered in their order."""
-        points = np.concatenate([np.empty((0, 3)), *clouds])
-        number = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
-        self._sizes = [len(cloud) for cloud in clouds]
-        self._total = len(points)
-        digits = range(max(1, (len(clouds) - 1).bit_length()))
-        self._trees = [[KDTree(points[number >> digit & 1 == value]) for value in (0, 1)] for digit in digits]
-
-    def distance(self, cloud: Float64[ndarray, "n 3"], index: int) -> float:
-        """Median distance from the points of `cloud` to the nearest one of any cloud but number `index`.
-
-        Infinite where either side has too few points.
-        """
-        if len(cloud) < _FEWEST_POINTS or self._total - self._sizes[index] < _FEWEST_POINTS:
-            return np.inf
-        trees = [pair[1 - (index >> digit & 1)] for digit, pair in enumerate(self._trees)]
-        nearest = np.min([tree.query(cloud)[0] for tree in trees if tree.n], axis=0)
-        return float(np.median(nearest))
-
 
 # Other conventions that poses and coordinates may follow by mistake, and how well each of them fits.
 
 PoseConvention = Literal["as given", "inverted", "OpenCV axes", "inverted, OpenCV axes"]
 POSE_CONVENTIONS: tuple[PoseConvention, ...] = ("as given", "inverted", "OpenCV axes", "inverted, OpenCV axes")
 _OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # device axes of OpenCV <-> of this format
-_CLOUD_POINTS = 100  # of a frame, for distances between frames
-_FEWEST_CLOUD_POINTS = 20  # the same in a scan of very many frames
-_MOST_POINTS = 200_000  # of all frames together
 
 
 @dataclass(frozen=True)
@@ -102,26 +36,6 @@ class Interpretation:
     swapped: bool = False
     mirrored_x: bool = False
     mirrored_y: bool = False
-
-
-@dataclass(frozen=True)
-class GeometricFit:
-    """How well rays meet and frames agree under one interpretation, frame by frame."""
-
-    residual_px: Float64[ndarray, "n"]  # median epipolar residual; inf: most points are behind a device
-    spread: Float64[ndarray, "n"]  # median distance to the points of other frames, in depths; inf: too few points
-    depth: float  # median distance of all points from their cameras; 0: no points
-    clouds: tuple[Float64[ndarray, "_ 3"], ...]  # some triangulated points of each frame
-
-    @property
-    def typical_px(self) -> float:
-        """Median of the frames' residuals."""
-        return float(np.median(self.residual_px))
-
-    @property
-    def typical_spread(self) -> float:
-        """Median of the frames' spreads."""
-        return float(np.median(self.spread))
 
 
 def other_interpretations() -> Iterator[Interpretation]:
@@ -150,29 +64,6 @@ def apply_interpretation(interpretation: Interpretation, frame: Correspondences,
     )
 
 
-def fit_geometry(frames: Sequence[Correspondences], projector: Device) -> GeometricFit:
-    """Triangulate all frames; measure how well rays meet and how well frames agree."""
-    camera = Intrinsics.of([f.camera for f in frames], torch.float64).reshape(-1, 1)
-    geometry = (
-        camera,
-        _stack(f.T_world_camera for f in frames)[:, None],
-        _stack(f.uv_camera for f in frames),
-        Intrinsics.of(projector, torch.float64),
-        _stack(f.T_world_projector for f in frames)[:, None],
-        _stack(f.uv_projector for f in frames),
-    )
-    residual = epipolar_residual(*geometry).abs().nan_to_num(nan=torch.inf)
-    in_front = residual.isfinite()
-    points = triangulate(*geometry)
-    depth = float(points.depth_camera[in_front].median()) if in_front.any() else 0.0
-    count = max(_FEWEST_CLOUD_POINTS, min(_CLOUD_POINTS, _MOST_POINTS // len(frames)))
-    seen = [p[ok].numpy() for p, ok in zip(points.p_world, in_front, strict=True)]
-    clouds = tuple(cloud[:: max(1, len(cloud) // count)] for cloud in seen)
-    others = OtherClouds(clouds)
-    spread = [others.distance(cloud, index) for index, cloud in enumerate(clouds)]
-    return GeometricFit(residual.median(-1).values.numpy(), np.array(spread) / max(depth, 1e-300), depth, clouds)
-
-
 def _converted_pose(T: Float64[ndarray, "4 4"], convention: PoseConvention) -> Float64[ndarray, "4 4"]:
     out = np.linalg.inv(T) if convention.startswith("inverted") else T
     return out @ _OPENCV if convention.endswith("OpenCV axes") else out
@@ -182,10 +73,6 @@ def converted_coords(uv: Float[ndarray, "n 2"], how: Interpretation, size: tuple
     """Coordinates in a pattern of `size` (w, h), with axes exchanged and mirrored."""
     x, y = uv.T[::-1] if how.swapped else uv.T
     return np.stack([size[0] - x if how.mirrored_x else x, size[1] - y if how.mirrored_y else y], -1)
-
-
-def _stack(arrays: Iterator[Float64[ndarray, "..."]]) -> Tensor:
-    return torch.from_numpy(np.stack(list(arrays)))
 
 
 # The words in which wrong conventions are reported.
@@ -279,11 +166,12 @@ def hopeless(given: GeometricFit, bad: int, count: int) -> Problem:
 
 
 # Epipolar residuals as fractions of the projector's focal length: angles in radians.
-_SUSPECT = 0.01  # 0.6 degrees: worse than auto-calibration usually is
+_ROUGH = 0.03  # 1.7 degrees: in a scan worse than that, a single frame that fits better tells nothing
 _SUSPECT_FRAME = 0.05  # of one frame among good ones
 _FITS = 0.05  # the largest residual of an interpretation that "fits"
 _HOPELESS = 0.35  # 19 degrees: no calibration is that wrong
 _MUCH_BETTER = 0.2  # factor by which the right interpretation must lower the residual
+_CLEARLY = 0.1  # the same where it stays beyond what is stated
 _MUCH_CLOSER = 0.4  # factor by which the right interpretation must lower the distance between surfaces
 _ONE_SURFACE = 0.1  # the largest distance it may leave, in working distances, with frames wrong by 10 degrees
 _MOST = 0.9  # share of hopeless frames that makes a scan hopeless
@@ -300,16 +188,24 @@ def convention_problems(
     """
     given = fit_geometry(frames, projector)
     focal = (projector.fl_x + projector.fl_y) / 2
+    copied = copied_poses(frames, given, focal)
+    if copied is not None:
+        yield None, *copied
+        return
     interpretation = _better_interpretation(frames, projector, given, focal)
     if interpretation is not None:
         yield None, key_of(interpretation), describe(interpretation, given)
+        return
+    mixed = mixed_poses(frames, projector, given)
+    if mixed is not None:
+        yield None, *mixed
         return
     lost = given.residual_px > _HOPELESS * focal
     if lost.mean() >= _MOST:
         yield None, "transform_matrix", hopeless(given, int(lost.sum()), len(frames))
         return
     explained: set[int] = set()
-    if len(frames) > 2:
+    if len(frames) > 2 and given.typical_px <= _ROUGH * focal:
         others = OtherClouds(given.clouds)
         for index, frame in enumerate(frames):
             own = _better_interpretation_of_frame(frames, index, projector, given, others, focal)
@@ -343,12 +239,13 @@ def _better_interpretation(
     frames: Sequence[Correspondences], projector: Device, given: GeometricFit, focal: float
 ) -> Interpretation | None:
     """The interpretation under which the whole scan fits; None if it fits as it is, or nothing helps."""
-    if given.typical_px <= _SUSPECT * focal and given.typical_spread <= APART:
+    if not is_suspect(given, focal) and given.typical_px <= SUSPECT * focal and given.typical_spread <= APART:
         return None
     found: list[tuple[float, Interpretation]] = []
     for interpretation in other_interpretations():
         fit = fit_geometry([apply_interpretation(interpretation, frame, projector) for frame in frames], projector)
-        if _explains(given.typical_px, given.typical_spread, fit.typical_px, fit.typical_spread, focal):
+        stands = not fit.typical_excess > max(SUSPECT_SIGMAS, _CLEARLY * given.typical_excess)
+        if stands and _explains(given.typical_px, given.typical_spread, fit.typical_px, fit.typical_spread, focal):
             found.append((_badness(fit.typical_px, fit.typical_spread, focal), interpretation))
     return min(found, key=lambda item: item[0])[1] if found else None
 
@@ -394,8 +291,8 @@ def _explains(px_before: float, spread_before: float, px: float, spread: float, 
     """Whether an interpretation fits, and so much better than the one before that it cannot be chance."""
     if px > _FITS * focal:
         return False
-    if px_before > _SUSPECT * focal and px < _MUCH_BETTER * px_before:
-        return px < _SUSPECT * focal or spread <= max(APART, spread_before)
+    if px_before > SUSPECT * focal and px < _MUCH_BETTER * px_before:
+        return px < SUSPECT * focal or spread <= max(APART, spread_before)
     # The rays meet equally well in both: only the agreement of the frames decides. Views that never overlap
     # (a room seen from its middle) may come closer to each other when misinterpreted, but not to one surface.
     return spread_before > APART and spread < min(_MUCH_CLOSER * spread_before, _ONE_SURFACE) and px < 2 * px_before + 1

@@ -1,6 +1,7 @@
 """Image and coordinate files: those of a scan, read exactly as stored or not at all, and photographs."""
 
 import math
+import shlex
 import struct
 import warnings
 import zipfile
@@ -60,12 +61,20 @@ def read_header(path: Path) -> ImageHeader:
     return header
 
 
-def read_header_and_orientation(path: Path) -> tuple[ImageHeader, int]:
-    """Size and kind as stored, and the EXIF orientation (1: as stored). Raises FileError for other kinds."""
+def read_header_and_orientation(path: Path, photograph: bool = False) -> tuple[ImageHeader, int]:
+    """Size and kind as stored, and the EXIF orientation (1: as stored). Raises FileError for other kinds.
+
+    Of a photograph with a palette or an alpha channel the pixels are decoded, too: they say whether it can be used.
+    """
     check_file(path)
     try:
         with path.open("rb") as stream:
             image = _open(path, stream)
+            if photograph and _has_more(image):
+                pixels = _plain_pixels(path, read_bytes(path), image)
+                h, w = pixels.shape[:2]
+                header = ImageHeader(w, h, "grey" if pixels.ndim == 2 else "RGB", 8 * pixels.itemsize)
+                return header, _orientation(path, image)
             return _header(path, image), _orientation(path, image)
     except OSError as error:
         raise unreadable(path, error) from error
@@ -82,10 +91,17 @@ def read_image(path: Path) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c
     return pixels
 
 
-def read_pixels_and_orientation(path: Path) -> tuple[UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"], int]:
-    """The pixels as stored, and the EXIF orientation (1: as stored). Raises FileError like `read_image`."""
+def read_pixels_and_orientation(
+    path: Path, photograph: bool = False
+) -> tuple[UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"], int]:
+    """The pixels as stored, and the EXIF orientation (1: as stored). Raises FileError like `read_image`.
+
+    A photograph may have an alpha channel that is opaque, a palette of greys, or one bit per pixel.
+    """
     content = read_bytes(path)
     image = _open(path, BytesIO(content))
+    if photograph and _has_more(image):
+        return _plain_pixels(path, content, image), _orientation(path, image)
     header = _header(path, image)
     _orientation(path, image)
     try:
@@ -93,17 +109,12 @@ def read_pixels_and_orientation(path: Path) -> tuple[UInt8[ndarray, "h w *c"] | 
     except MemoryError as error:
         raise FileError(path, "does not fit into memory", "the image is huge", "use smaller images") from error
     except _DAMAGE as error:
-        raise FileError(
-            path,
-            f"cannot be decoded ({error})",
-            "the file is truncated or damaged, for example by an interrupted copy or a full disk",
-            "copy or export this image again",
-        ) from error
+        raise _undecodable(path, error) from error
     if isinstance(image, PngImageFile):
         _check_png_sums(path, content)
     orientation = _orientation(path, image)  # again: a PNG may have the tag after its pixels
     if header.bits == 16 and header.mode == "RGB":
-        return _decode_deep_colour(path, content), orientation
+        return _decode_deep(path, content, 3), orientation
     pixels = np.array(image)
     return (pixels.astype(np.uint16) if header.bits == 16 else pixels), orientation
 
@@ -170,6 +181,50 @@ def _header(path: Path, image: ImageFile) -> ImageHeader:
     )
 
 
+def _has_more(image: ImageFile) -> bool:
+    """Whether an image has a palette, transparency, or one bit per pixel."""
+    return image.mode in _OTHER_KINDS or "transparency" in image.info
+
+
+def _plain_pixels(path: Path, content: bytes, image: ImageFile) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]:
+    """The pixels of a photograph without its palette and its alpha channel.
+
+    Raises FileError if it is transparent anywhere, or its palette has colours: which intensity such pixels have is not
+    certain.
+    """
+    deep = ";16" in (str(image.tile[0][3]) if image.tile else "")
+    try:
+        values = _decode_deep(path, content, 4) if deep else np.array(image.convert("RGBA"))
+    except MemoryError as error:
+        raise FileError(path, "does not fit into memory", "the image is huge", "use smaller images") from error
+    except _DAMAGE as error:
+        raise _undecodable(path, error) from error
+    if isinstance(image, PngImageFile):
+        _check_png_sums(path, content)
+    pixels, alpha = values[..., :3], values[..., 3]
+    opaque = bool((alpha == np.iinfo(values.dtype).max).all())
+    grey = image.mode in ("1", "LA", "L") or (image.mode in ("P", "PA") and bool((pixels == pixels[..., :1]).all()))
+    if not opaque or (image.mode in ("P", "PA") and not grey):
+        raise FileError(
+            path,
+            "has a palette of colours" if opaque else "is transparent in places",
+            "it was cut out or reduced to few colours by a program; which intensity such pixels had is not certain",
+            'save the photographs again from the camera, or convert them: python -c "import sys, pathlib; from PIL '
+            "import Image; [Image.open(p).convert('RGB').save('converted/' + pathlib.Path(p).name) for p in "
+            f'sys.argv[1:]]" {shlex.quote(str(path.parent))}/*{path.suffix}, after mkdir converted',
+        )
+    return np.ascontiguousarray(pixels[..., 0] if grey else pixels)
+
+
+def _undecodable(path: Path, error: Exception) -> FileError:
+    return FileError(
+        path,
+        f"cannot be decoded ({error})",
+        "the file is truncated or damaged, for example by an interrupted copy or a full disk",
+        "copy or export this image again",
+    )
+
+
 def _check_png_sums(path: Path, content: bytes) -> None:
     """Pillow decodes pixels without looking at the check sum that PNG keeps of every part. Raises FileError."""
     place = len(_PNG_SIGNATURE)
@@ -212,19 +267,19 @@ def _refuse_orientation(path: Path, orientation: int) -> None:
         )
 
 
-def _decode_deep_colour(path: Path, content: bytes) -> UInt16[ndarray, "h w 3"]:
-    """16-bit RGB, which Pillow would reduce to 8 bit."""
+def _decode_deep(path: Path, content: bytes, channels: int) -> UInt16[ndarray, "h w c"]:
+    """16-bit RGB or RGBA, which Pillow would reduce to 8 bit."""
     import cv2
 
     pixels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] != 3:
+    if pixels is None or pixels.dtype != np.uint16 or pixels.ndim != 3 or pixels.shape[2] != channels:
         raise FileError(
             path,
-            "cannot be decoded as 16-bit RGB",
+            f"cannot be decoded as 16-bit RGB{'A' * (channels - 3)}",
             "it is an unusual variant of its format",
             "save it as PNG, grey or RGB, with 8 or 16 bits",
         )
-    return np.ascontiguousarray(pixels[..., ::-1])
+    return np.ascontiguousarray(pixels[..., [2, 1, 0, 3][:channels]])
 
 
 # Photographs as cameras and phones write them: turned as their EXIF tag says, HEIC too; raw files are refused.
@@ -255,7 +310,7 @@ def read_photograph(path: Path) -> Pixels:
         raise raw_file(path)
     if path.suffix.lower() in PHONE:
         return np.asarray(_open_heif(path).to_pillow().convert("RGB"))
-    pixels, orientation = read_pixels_and_orientation(path)
+    pixels, orientation = read_pixels_and_orientation(path, photograph=True)
     return turned(pixels, orientation)
 
 
@@ -266,7 +321,7 @@ def photograph_header(path: Path) -> ImageHeader:
     if path.suffix.lower() in PHONE:
         w, h = _open_heif(path).size
         return ImageHeader(w, h, "RGB", 8)
-    header, orientation = read_header_and_orientation(path)
+    header, orientation = read_header_and_orientation(path, photograph=True)
     if orientation in _TRANSPOSED:
         return ImageHeader(header.h, header.w, header.mode, header.bits)
     return header
@@ -274,7 +329,7 @@ def photograph_header(path: Path) -> ImageHeader:
 
 def turned_by_tag(path: Path) -> bool:
     """Whether an EXIF tag says that the pixels are stored turned or mirrored. Raises FileError if it is no image."""
-    return path.suffix.lower() not in PHONE and read_header_and_orientation(path)[1] != 1
+    return path.suffix.lower() not in PHONE and read_header_and_orientation(path, True)[1] != 1
 
 
 def turned(pixels: Pixels, orientation: int) -> Pixels:
@@ -329,7 +384,7 @@ def is_mosaic(pixels: Pixels) -> bool:
 def refuse_mosaic(path: Path) -> None:
     """Raise FileError if an image is a raw mosaic; one that cannot be read is not looked at."""
     try:
-        mosaic = path.suffix.lower() not in PHONE and is_mosaic(read_pixels_and_orientation(path)[0])
+        mosaic = path.suffix.lower() not in PHONE and is_mosaic(read_pixels_and_orientation(path, True)[0])
     except FileError:
         return
     if mosaic:

@@ -1,6 +1,7 @@
 """Reading a scan folder."""
 
 import os
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,8 +22,9 @@ from sl_nerfstudio.scan.document import (
     frame_label,
     read_document,
     read_path,
+    unreadable,
 )
-from sl_nerfstudio.scan.images import read_coords_size, read_header
+from sl_nerfstudio.scan.images import ENDINGS, read_coords_size, read_header
 from sl_nerfstudio.scan.types import (
     CAMERA_KEYS,
     FARTHEST,
@@ -349,7 +351,59 @@ def _transforms_path(root: Path) -> Path:
         raise FileError(
             root, f"is missing: {root} {what}", "the path is mistyped", "give the folder that holds transforms.json"
         )
+    if not os.path.lexists(root / TRANSFORMS):
+        raise _no_scan(root)
     return root / TRANSFORMS
+
+
+def _no_scan(root: Path) -> FileError:
+    """The error of a folder without transforms.json, by what it holds instead."""
+    try:
+        scans = [path for path in _folders(root) if (path / TRANSFORMS).is_file()]
+        parts = sorted(path.name for path in root.glob("transforms_*.json"))
+        captures = None if (root / "coords").is_dir() else _captures_in(root)
+    except OSError as error:
+        return unreadable(root, error)
+    missing = f"is missing in {root}"
+    if len(scans) == 1:
+        return FileError(root, f"{missing}; there is one in {scans[0].name}", "a folder too high", f"give {scans[0]}")
+    if parts:
+        return FileError(
+            root,
+            f"{missing}, but there is {', '.join(parts[:3])}",
+            "this is a data set in parts, as Blender's are, captured without a pattern projector",
+            "make a scan from captures of a projected pattern with sl-process; if it is a scan, rename its file to "
+            f"{TRANSFORMS}",
+        )
+    if captures is not None:
+        return FileError(
+            root,
+            f"{missing}: these are photographs, not a scan",
+            "a scan is made from photographs by sl-process",
+            f"make one: sl-process --images {shlex.quote(str(captures))} --pattern pattern.json --intrinsics "
+            "intrinsics.json --output scan; then give the folder scan",
+        )
+    return FileError(
+        root, missing, "it was moved, renamed or never written, or its name differs in upper and lower case",
+        "give the folder that holds transforms.json; sl-process makes one from photographs",
+    )  # fmt: skip
+
+
+def _captures_in(root: Path) -> Path | None:
+    """The folder that sl-process takes, if `root` holds photographs: itself, or a folder in it."""
+
+    def pictures(folder: Path) -> bool:
+        return any(path.suffix.lower() in ENDINGS for path in folder.iterdir())
+
+    frames = [folder for folder in _folders(root) if pictures(folder)]
+    if pictures(root) or len(frames) > 1:
+        return root
+    around = [folder for folder in _folders(root) if any(map(pictures, _folders(folder)))]
+    return next(iter([*frames, *around]), None)
+
+
+def _folders(root: Path) -> list[Path]:
+    return sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
 
 
 def _frame_records(top: Fields) -> list[Any]:

@@ -242,6 +242,10 @@ class Frame:
             return read_image(self.mask_path) > 0
         return np.isfinite(self.read_coords()).all(-1)
 
+    def read_masked_coords(self) -> Float32[ndarray, "h w 2"]:
+        """Pattern coordinates where the mask allows them, NaN elsewhere."""
+        return np.where(self.read_mask()[..., None], self.read_coords(), np.float32(np.nan))
+
 
 @dataclass(frozen=True)
 class Scan:

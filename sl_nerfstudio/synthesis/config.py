@@ -9,6 +9,7 @@ import numpy as np
 from sl_nerfstudio.errors import UserError
 
 Units = Literal["m", "cm", "mm", "um", "arbitrary"]
+PathKind = Literal["hand-held", "half-turn", "rigid-rig", "static-projector"]
 MILLIMETRES = {"m": 1e-3, "cm": 0.1, "mm": 1.0, "um": 1e3, "arbitrary": 1.0}
 """A millimetre in each unit; an unknown unit counts as a millimetre."""
 
@@ -19,8 +20,9 @@ class SynthConfig:
 
     scene: str = "cone-and-cylinder"
     """cone-and-cylinder, head, frog, chair, leaf, dog, vase, medal; with weak geometry: staircase, bottle, spheres,
-    bump, relief, rod; or a mesh file (.ply .obj .stl .glb) whose lengths are in --units; chessboard, charuco:
-    photographs of a calibration board under a pattern, for sl-calibrate"""
+    bump, relief, rod; parts that look the same from several sides but for one feature, another one for each --seed:
+    flange, knob, disc, gear, box, labelled-bottle; or a mesh file (.ply .obj .stl .glb) whose lengths are in --units;
+    chessboard, charuco: photographs of a calibration board under a pattern, for sl-calibrate"""
     appearance: Literal["plain", "realistic", "hard"] = "plain"
     """plain: grey images of a matte surface; realistic: colour photographs with texture, gloss, defocus, motion, room
     light, interreflection, changing exposure, gamma, JPEG and, among --images-only, a few useless frames; hard: all of
@@ -37,8 +39,9 @@ class SynthConfig:
     seed: int = 0
     """random seed: the same flags give the same bytes"""
 
-    path: Literal["hand-held", "rigid-rig", "static-projector"] = "hand-held"
-    """hand-held: camera and projector move independently; rigid-rig: together; static-projector: only the camera"""
+    path: PathKind = "hand-held"
+    """hand-held: camera and projector move independently around the object; half-turn: likewise, but along one side of
+    it; rigid-rig: they move together; static-projector: only the camera moves"""
     projector_model: Literal["OPENCV", "DOE"] = "OPENCV"
     """pinhole, or a diffractive element whose pattern is uniform in direction cosines"""
     camera_distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)

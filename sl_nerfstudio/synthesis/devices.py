@@ -1,7 +1,6 @@
 """Devices that fit a scene, their paths around it, and the errors of poses, coordinates and images."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -13,7 +12,7 @@ from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unprojec
 from sl_nerfstudio.geometry.lie import DevicePoses, exp_so3, fit_similarity, log_so3
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan.types import PoseSigma
-from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.config import PathKind, SynthConfig
 from sl_nerfstudio.synthesis.sdf import Scene
 
 # Intrinsics: the object fills the image, and the pattern covers the object.
@@ -71,7 +70,6 @@ def pixels(
 
 # Poses of camera and projector in each frame: smooth paths around the object, as if hand-held.
 
-PathKind = Literal["hand-held", "rigid-rig", "static-projector"]
 DISTANCE = 4.5  # of the devices from the object, in sizes of the object
 _DISTANCE_SWING = 0.06
 _BASELINE = (0.75, 1.5)  # in sizes of the object
@@ -83,13 +81,15 @@ _FRAMES_A_LAP = 30
 def make_paths(scene: Scene, frames: int, kind: PathKind, rng: np.random.Generator) -> DevicePoses:
     """Poses of `frames` captures, in millimetres, about the scene's centre.
 
-    hand-held: both devices move independently, so their relative pose differs in every frame; rigid-rig: one relative
-    pose for all; static-projector: the projector does not move, the camera circles around the projector's axis.
+    hand-held: both devices move independently, so their relative pose differs in every frame; half-turn: likewise, but
+    around half of the object; rigid-rig: one relative pose for all; static-projector: the projector does not move, the
+    camera circles around the projector's axis.
     """
     t = np.arange(frames) / frames
     if kind == "static-projector":
         return _about_a_projector(scene, t, rng)
-    camera = _around_the_object(scene, t, rng)
+    laps = 0.5 if kind == "half-turn" else float(max(1, round(frames / _FRAMES_A_LAP)))
+    camera = _around_the_object(scene, t, laps, rng)
     if kind == "rigid-rig":
         T_camera_projector = _rig(scene)
         return DevicePoses(camera, camera @ T_camera_projector)
@@ -141,9 +141,10 @@ def _aim(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Generator) -> Floa
     return scene.centre + _AIM_SWING * scene.size * swing
 
 
-def _around_the_object(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Generator) -> Float64[ndarray, "n 4 4"]:
+def _around_the_object(
+    scene: Scene, t: Float[ndarray, "n"], laps: float, rng: np.random.Generator
+) -> Float64[ndarray, "n 4 4"]:
     """Laps around the object, up and down between the scene's lowest and highest elevation."""
-    laps = max(1, round(len(t) / _FRAMES_A_LAP))
     azimuth = rng.uniform(0, 2 * np.pi) + 2 * np.pi * laps * t + np.radians(4.0) * wander(t, rng, 5.0)
     low, high = np.radians(scene.elevation_deg)
     swing = np.sin(2 * np.pi * (2 * laps + 0.5) * t + rng.uniform(0, 2 * np.pi))

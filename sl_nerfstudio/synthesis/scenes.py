@@ -13,10 +13,12 @@ from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.synthesis.parts import PARTS
 from sl_nerfstudio.synthesis.sdf import (
     Field,
     Scene,
     Triple,
+    block,
     capsule,
     carve,
     cylinder,
@@ -547,7 +549,7 @@ _FROM_ABOVE = (45.0, 78.0)  # degrees: planes that lie down are seen from above
 
 def staircase(cell: float = 1.0) -> Scene:
     """Five steps, 90 x 60 x 40 mm: parallel planes at five heights, and risers."""
-    steps = [_block((18.0 * k - 45, -30, 0), (45, 30, 8.0 * k + 8)) for k in range(5)]
+    steps = [block((18.0 * k - 45, -30, 0), (45, 30, 8.0 * k + 8)) for k in range(5)]
     return mesh_of("staircase", union(0.0, *steps), (-50, -35, -4), (50, 35, 45), cell, _FROM_ABOVE)
 
 
@@ -569,7 +571,7 @@ def spheres(cell: float = 1.2) -> Scene:
 
 def bump(cell: float = 1.0) -> Scene:
     """A plate of 100 x 80 x 5 mm with one bump, 7 mm higher."""
-    plate = _block((-50, -40, 0), (50, 40, 5))
+    plate = block((-50, -40, 0), (50, 40, 5))
     solid = union(6.0, plate, ellipsoid((14, -9, 5), (17, 12, 7)))
     flat = carve(0.0, solid, half_space((0, 0, 1), 0.0))
     return mesh_of("bump", flat, (-55, -45, -4), (55, 45, 16), cell, _FROM_ABOVE)
@@ -585,7 +587,7 @@ def relief(cell: float = 1.0) -> Scene:
         end = (x + 12 * float(np.cos(a)), y + 10 * float(np.sin(a)), 5.0)
         marks.append(capsule((x, y, 5.0), end, 2.2, 1.4))
     domes = [ellipsoid((x, y, 5), (9, 9, 2.5)) for x, y in ((-30, 18), (8, -20), (36, 12))]
-    solid = union(1.5, _block((-60, -45, 0), (60, 45, 5)), *marks, *domes)
+    solid = union(1.5, block((-60, -45, 0), (60, 45, 5)), *marks, *domes)
     flat = carve(0.0, solid, half_space((0, 0, 1), 0.0))
     return mesh_of("relief", flat, (-65, -50, -4), (65, 50, 13), cell, _FROM_ABOVE)
 
@@ -598,17 +600,7 @@ def rod(cell: float = 1.0) -> Scene:
     return mesh_of("rod", union(2.0, shaft, end, *collars), (-85, -12, -5), (85, 14, 20), cell)
 
 
-def _block(low: Triple, high: Triple) -> Field:
-    """A box with sharp edges."""
-    middle, half = (np.add(low, high)) / 2, np.subtract(high, low) / 2
-
-    def field(p: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-        q = np.abs(p - middle) - half
-        return np.sqrt((np.maximum(q, 0) ** 2).sum(-1)) + np.minimum(q.max(-1), 0)
-
-    return field
-
-
+_SHAPE = 12  # stream of random numbers: the others are those of `synthesise`
 MESH_FORMATS = (".ply", ".obj", ".stl", ".glb", ".gltf", ".off")
 BUILT_IN: dict[str, Callable[[], Scene]] = {
     "cone-and-cylinder": cone_and_cylinder,
@@ -628,26 +620,28 @@ BUILT_IN: dict[str, Callable[[], Scene]] = {
 }
 
 
-def make_scene(name: str, file_unit: float = 1.0) -> Scene:
-    """A built-in scene, or the mesh in a file whose unit is `file_unit` millimetres.
+def make_scene(name: str, file_unit: float = 1.0, seed: int = 0) -> Scene:
+    """A built-in scene, the part of a kind that `seed` stands for, or the mesh in a file of unit `file_unit` mm.
 
-    Raises UserError for a name that is neither.
+    Raises UserError for a name that is none of these.
     """
     if name in BUILT_IN:
         return _built_in(name)
+    if name in PARTS:
+        return _built_in(name, seed)
     path = Path(name)
     if path.suffix.lower() not in MESH_FORMATS:
         raise UserError(
-            f"--scene {name}: neither a built-in scene ({', '.join(BUILT_IN)}) "
+            f"--scene {name}: neither a built-in scene ({', '.join((*BUILT_IN, *PARTS))}) "
             f"nor a mesh file ({' '.join(MESH_FORMATS)})"
         )
     return _read_mesh(path, file_unit)
 
 
 @cache
-def _built_in(name: str) -> Scene:
+def _built_in(name: str, seed: int | None = None) -> Scene:
     """Meshed once in a process: of the finest that takes seconds. Nobody may write to it."""
-    scene = BUILT_IN[name]()
+    scene = BUILT_IN[name]() if seed is None else PARTS[name](np.random.default_rng([seed, _SHAPE])).scene(name)
     for values in (scene.vertices, scene.faces, scene.vertex_normals):
         if values is not None:
             values.flags.writeable = False

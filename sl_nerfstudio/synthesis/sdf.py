@@ -101,6 +101,17 @@ def cylinder(a: Triple, b: Triple, radius: Number, rounding: Number = 0.0) -> Fi
     return field
 
 
+def block(low: Triple, high: Triple) -> Field:
+    """A box with sharp edges."""
+    middle, half = (np.add(low, high)) / 2, np.subtract(high, low) / 2
+
+    def field(p: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+        q = np.abs(p - middle) - half
+        return np.sqrt((np.maximum(q, 0) ** 2).sum(-1)) + np.minimum(q.max(-1), 0)
+
+    return field
+
+
 def ridges(solid: Field, height: float, wave: Field) -> Field:
     """The solid with its surface raised and lowered by up to `height`; `wave` gives the phase in radians."""
     return lambda p: solid(p) - height * np.sin(wave(p))

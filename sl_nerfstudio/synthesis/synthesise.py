@@ -127,7 +127,7 @@ class Setup:
 
 def make_setup(config: SynthConfig) -> Setup:
     """Scene, devices, paths and their errors, as configured. Raises UserError for bad files."""
-    scene = make_scene(config.scene, 1 / MILLIMETRES[config.units])
+    scene = make_scene(config.scene, 1 / MILLIMETRES[config.units], config.seed)
     if config.background != "none":
         scene = above_the_table(scene)
     surroundings = make_surroundings(scene, config.background, random_stream(config.seed, Stream.SURROUNDINGS))

@@ -11,7 +11,7 @@ from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations
 from sl_nerfstudio.bundle_adjustment.parameters import INTRINSICS_SIGMA, PosePrior, by_kind, gauge_directions
 from sl_nerfstudio.bundle_adjustment.residuals import Linearisation, Rig
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_se3, pose, transform
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_se3, log_so3, pose, transform
 from sl_nerfstudio.geometry.triangulation import pixel_centres, pixel_rays
 
 BALLS = ((0.35, 0.1, 0.0, 0.3), (-0.35, 0.3, -0.05, 0.25), (-0.05, -0.4, -0.1, 0.2))  # x, y, z, radius
@@ -142,6 +142,12 @@ def turned(rig: Rig, frame: int, degrees: float) -> Rig:
     turn = torch.tensor([0, 0, 0, 0.3, 0.5, 0.85], dtype=torch.float64) * radians(degrees)
     cameras[frame] = exp_se3(turn) @ cameras[frame]
     return replace(rig, T_world_camera=cameras)
+
+
+def turns_deg(rig: Rig, other: Rig) -> Tensor:
+    """Rotation of each frame against another rig, when their first frames coincide."""
+    a, b = (inverse(r.T_world_camera[:1]) @ r.T_world_camera for r in (rig, other))
+    return torch.rad2deg(log_so3((a @ inverse(b))[:, :3, :3]).norm(dim=-1))
 
 
 def prior_of(frames: int, *sigmas: float, intrinsics: float = INTRINSICS_SIGMA) -> PosePrior:

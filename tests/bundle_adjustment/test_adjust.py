@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment import adjust as adjustment
-from sl_nerfstudio.bundle_adjustment import observations
+from sl_nerfstudio.bundle_adjustment import modes, observations
 from sl_nerfstudio.bundle_adjustment.adjust import (
     Adjustment,
     CrossValidation,
@@ -21,12 +21,12 @@ from sl_nerfstudio.bundle_adjustment.adjust import (
     adjust,
     cross_validate,
     find_minimum,
-    mean_and_error,
     with_other_minima,
 )
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
-from sl_nerfstudio.bundle_adjustment.covariance import departure_of
+from sl_nerfstudio.bundle_adjustment.modes import departure_of
 from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, constrained
+from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.geometry.lie import exp_se3, fit_similarity, inverse, log_so3
@@ -98,7 +98,7 @@ def test_a_rigid_rig_moves_all_projectors_alike(true, maps, monkeypatch):
     common = exp_se3(torch.tensor([0.01, -0.01, 0.005, 0.002, -0.003, 0.004], dtype=torch.float64))
     start = disturbed(true, 2, degrees=0.3, shift=0.01)
     start = replace(start, T_camera_projector=common @ start.T_camera_projector)
-    brief = replace(QUICK, max_iterations=8, other_minima=0)
+    brief = replace(QUICK, max_iterations=8, other_minima=False)
     found = adjust(start, maps, loose_prior(FRAMES, 0.5), "rigid-rig", brief).rig
     moved = found.T_camera_projector @ inverse(start.T_camera_projector)
     assert torch.allclose(moved, moved[:1].expand_as(moved), rtol=0, atol=1e-12)
@@ -122,7 +122,7 @@ def test_off_moves_nothing_and_exact_starts_stay(true, maps, exact):
     assert torch.equal(off.rig.T_world_camera, start.T_world_camera)
     assert torch.equal(off.rig.T_camera_projector, start.T_camera_projector)
     assert torch.equal(off.covariance, torch.zeros_like(off.covariance))
-    found = adjust(true, exact, PRIOR, "free", replace(QUICK, max_iterations=3, other_minima=0))
+    found = adjust(true, exact, PRIOR, "free", replace(QUICK, max_iterations=3, other_minima=False))
     assert (found.rig.T_world_camera - true.T_world_camera).abs().max() < 1e-5
     assert (found.rig.T_camera_projector - true.T_camera_projector).abs().max() < 1e-5
 
@@ -144,12 +144,12 @@ def test_wrong_cells_do_not_spoil_it(true, exact):
     """3 % of the cells of 5 x 5 pixels."""
     cells = torch.rand(FRAMES, SIZE // 5, SIZE // 5, generator=torch.Generator().manual_seed(0)) < 0.03
     spoilt = SpoiltMaps(**vars(exact), wrong=cells.repeat_interleave(5, 1).repeat_interleave(5, 2))
-    settings = replace(QUICK, max_iterations=30, other_minima=0)
+    settings = replace(QUICK, max_iterations=30, other_minima=False)
     assert_recovered(adjust(disturbed(true), spoilt, PRIOR, "known-rig", settings).rig, true)
 
 
 def test_one_seed_one_result(true, maps):
-    brief = replace(QUICK, anchors_per_frame=30, max_iterations=3, other_minima=0)
+    brief = replace(QUICK, anchors_per_frame=30, max_iterations=3, other_minima=False)
     a, b, c = (adjust(disturbed(true), maps, PRIOR, "free", replace(brief, seed=seed)).rig for seed in (5, 5, 6))
     assert torch.equal(a.T_world_camera, b.T_world_camera) and torch.equal(a.T_camera_projector, b.T_camera_projector)
     assert not torch.equal(a.T_world_camera, c.T_world_camera)
@@ -166,7 +166,7 @@ def test_frames_that_share_nothing_do_not_move(true, maps):
     assert torch.equal(none.rig.T_world_camera, disturbed(true).T_world_camera) and none.iterations == 0
     images = images_of(true, SIZE)
     images[2] = torch.full_like(images[2], float("nan"))
-    brief = replace(QUICK, max_iterations=3, other_minima=0)
+    brief = replace(QUICK, max_iterations=3, other_minima=False)
     found = adjust(true, CoordinateMaps.of(images), PRIOR, "free", brief).rig
     assert found.T_world_camera.isfinite().all() and found.T_camera_projector.isfinite().all()
     assert torch.allclose(found.T_world_camera[2], true.T_world_camera[2], atol=1e-9)
@@ -194,7 +194,7 @@ def test_errors_that_all_frames_share_near_borders_do_not_turn_the_cameras(monke
 FEW = 4
 TIGHT = prior_of(FEW, 0.03, radians(1.0), 0.003, radians(0.1), intrinsics=0.0)
 SEVERAL = AdjustmentSettings(anchors_per_frame=150, frames_per_anchor=3, max_iterations=30)
-ONE = replace(SEVERAL, other_minima=0)
+ONE = replace(SEVERAL, other_minima=False)
 
 
 def noisy_maps(seed: int, noise: float, size: int = SIZE) -> CoordinateMaps:
@@ -210,7 +210,7 @@ def test_frames_that_slide_on_a_plane_have_a_sigma_that_covers_their_error(monke
     true, maps = rig_of(FEW, SIZE), noisy_maps(0, 0.02)
     one = find_minimum(disturbed(true, 0), maps, TIGHT, "known-rig", SEVERAL)
     several = with_other_minima(one)
-    assert torch.equal(one.rig.T_world_camera, several.rig.T_world_camera) and several.searched is None
+    assert torch.equal(one.rig.T_world_camera, several.rig.T_world_camera) and several.explored is None
     assert with_other_minima(several) is several
     error = departure_of(true, one.rig)[: 6 * FEW]
     rms = [float((error / f.covariance.diagonal()[: 6 * FEW].sqrt()).pow(2).mean().sqrt()) for f in (one, several)]
@@ -224,7 +224,8 @@ def test_frames_that_slide_on_a_plane_have_a_sigma_that_covers_their_error(monke
 def searches(monkeypatch) -> list:
     """All searches, in order."""
     begun, search = [], adjustment.search
-    monkeypatch.setattr(adjustment, "search", lambda *a: begun.append(a) or search(*a))
+    for module in (adjustment, modes):
+        monkeypatch.setattr(module, "search", lambda *a: begun.append(a) or search(*a))
     return begun
 
 

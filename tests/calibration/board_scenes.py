@@ -65,6 +65,27 @@ def make_scene(
     return Scene(views, BoardRig(camera, projector, np.array(poses), T_pc))
 
 
+def equidistant_scene(seed: int, count: int, noise: float) -> Scene:
+    """Boards all over the image of a lens with r = f theta, seen whole or in part; the truth holds size and poses."""
+    rng = np.random.default_rng(seed)
+    camera, views, poses = Device(1280, 960, 815.0, 815.0, 652.0, 470.0), [], []
+    while len(views) < count:
+        T = np.eye(4)
+        angles = [*rng.uniform(-40, 40, 2), rng.uniform(-20, 20)]
+        T[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+        z = rng.uniform(250, 500)
+        T[:3, 3] = [rng.uniform(-0.75, 0.75) * z, rng.uniform(-0.55, 0.55) * z, -z] - T[:3, :3] @ POINTS.mean(0)
+        x, y, depth = ((POINTS @ T[:3, :3].T + T[:3, 3]) * [1, -1, -1]).T
+        radius = np.hypot(x, y)
+        uv = (camera.cx, camera.cy) + (camera.fl_x * np.arctan2(radius, depth) / radius)[:, None] * np.c_[x, y]
+        inside = (depth > 50) & (uv > 0).all(1) & (uv < (camera.w, camera.h)).all(1)
+        if 2 * inside.sum() > len(POINTS):
+            corners = Corners(np.flatnonzero(inside), uv[inside])
+            views.append(BoardView(f"pose {len(views)}", _noisy(corners, noise, rng), None))
+            poses.append(T)
+    return Scene(views, BoardRig(camera, None, np.array(poses), np.eye(4)))
+
+
 def _relative_pose(projector: Device, distance: float) -> ndarray:
     """The middle of the pattern falls on the middle of the camera's view."""
     T_cp = np.eye(4)

@@ -1,14 +1,25 @@
 """What is fitted, how far it can be trusted, and what to capture next."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from sl_nerfstudio.calibration.board import calibrate, next_pose
+from sl_nerfstudio.calibration.board import RadialMisfit, calibrate, next_pose, radial_misfit
+from sl_nerfstudio.calibration.board_adjustment import FreeIntrinsics, adjust, camera_start, residuals
 from sl_nerfstudio.cli.calibrate import next_pose_words, require_determined
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.review import verdict as verdicts
 from sl_nerfstudio.review.verdict import judge_calibration, shortcomings, undetermined
-from tests.calibration.board_scenes import BOARD, CAMERA, PLAIN_CAMERA, PLAIN_PROJECTOR, POINTS, make_scene
+from tests.calibration.board_scenes import (
+    BOARD,
+    CAMERA,
+    PLAIN_CAMERA,
+    PLAIN_PROJECTOR,
+    POINTS,
+    equidistant_scene,
+    make_scene,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -57,6 +68,26 @@ def test_stated_uncertainty_covers_the_errors(both, cameras):
             assert abs(got.fl_x / true.fl_x - 1) < 0.01
     ratios = np.array(ratios)
     assert (ratios < 3).all() and (ratios < 1).mean() > 0.5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_lens_that_is_none_of_the_models_is_no_good_calibration(seed):
+    """An equidistant lens of 76 x 61 degrees, beside lenses that the model describes."""
+    for scene, fits in (
+        (make_scene(seed, count=12, noise=0.1, camera=CAMERA, projector=None), True),
+        (equidistant_scene(seed, count=12, noise=0.1), False),
+    ):
+        seen = scene.seen
+        adjusted = adjust(camera_start(scene.views, scene.sizes[0], POINTS).rig, (FreeIntrinsics(False, 2),), seen)
+        found = radial_misfit(adjusted.rig.camera, seen[0], residuals(adjusted.rig, 0, seen[0]))
+        assert (found is None) == fits
+
+
+def test_the_verdict_says_that_a_lens_does_not_fit(both):
+    _, found = both
+    verdict = judge_calibration(replace(found, misfit=RadialMisfit(-0.2, 0.1)))
+    assert verdict.band != "good"
+    assert any("camera's lens does not fit" in reason and "fisheye" in reason for reason in verdict.reasons)
 
 
 def test_noise_of_either_device_is_recognised(both):

@@ -58,6 +58,24 @@ def test_exact_corners_give_the_exact_devices_and_poses(camera, projector, free)
     np.testing.assert_allclose(found.rig.T_projector_camera, scene.truth.T_projector_camera, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("aspect", [0.5, 0.7, 1.5, 2.0])
+@pytest.mark.parametrize("device", ["camera", "projector"])
+def test_pixels_need_not_be_square(device, aspect):
+    """A projector of 912 x 1140 diamond pixels has fl_y = 2 fl_x; the field of view stays that of square ones."""
+
+    def bent(one):
+        return replace(one, h=round(aspect * one.h), fl_y=aspect * one.fl_y, cy=aspect * one.cy)
+
+    devices = {"camera": PLAIN_CAMERA, "projector": PLAIN_PROJECTOR}
+    scene = make_scene(1, 5, noise=0.05, **(devices | {device: bent(devices[device])}))
+    start = camera_start(scene.views, scene.sizes[0], POINTS)
+    start = projector_start(start, scene.views, scene.sizes[1], POINTS, "OPENCV")
+    assert [one.aspect for one in start.free] == [device == "camera", device == "projector"]
+    for got, true in zip(start.rig.devices, scene.truth.devices, strict=True):
+        np.testing.assert_allclose(got.parameters[:2], true.parameters[:2], rtol=0.01)
+    assert max(start.sigma_px) < 0.1
+
+
 def test_the_unit_of_the_board_changes_lengths_alone():
     scene = make_scene(2, count=4, noise=0.1)
     mm, m = (solved(scene, (ONE, ONE), points=POINTS * unit) for unit in (1.0, 1e-3))

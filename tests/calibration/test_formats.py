@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from sl_nerfstudio.calibration.formats import read_device_file, read_entries, read_file_storage, reduce_distortion
+from sl_nerfstudio.calibration.formats import read_device_file, read_entries, reduce_distortion
 from sl_nerfstudio.calibration.stated import CERTAIN, read_stated_sigma
+from sl_nerfstudio.calibration.stored_values import read_stored_values
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 
@@ -150,7 +151,7 @@ def test_small_higher_terms_are_absorbed_and_large_ones_refused(tmp_path):
     assert np.allclose(reduced, LENS) and miss == 0
     fish = _storage(tmp_path / "d.yml", camera_matrix=K * [[0.4], [0.4], [1]],
                     distortion_coefficients=np.array([[-0.3, 0.1, 0, 0, 0.8]]))  # fmt: skip
-    with pytest.raises(UserError, match=r"beyond k1, k2, p1, p2, without which it is .* px off") as caught:
+    with pytest.raises(UserError, match=r"beyond k1, k2, p1, p2 \(k3 = 0.8\), without which it is .* px off") as caught:
         read_device_file(fish, "camera", (256, 192))
     assert "CALIB_FIX_K3" in str(caught.value)
 
@@ -232,7 +233,7 @@ def test_what_opencv_writes_is_read(tmp_path_factory, suffix, matrix, number, te
     file.write("number", number)
     file.write("text", "t" + text)
     file.release()
-    found = read_file_storage(path)
+    found = read_stored_values(path)
     np.testing.assert_array_equal(found["matrix"], matrix)
     np.testing.assert_allclose(found["small"], matrix.astype(np.float32), rtol=1e-6, atol=1e-37)
     assert found["number"] == number and found["text"].split() == ("t" + text).split()
@@ -242,3 +243,97 @@ def test_what_is_right_is_read(tmp_path):
     path = tmp_path / "a.xml"
     path.write_text(camera("900. 0.01 320. 0. 900. 240. 0. 0. 1."))  # a skew of a rounding
     assert read_device_file(path, "camera", SIZE).cx == 320.5
+
+
+def _rows(matrix):
+    return ";\n ".join(", ".join(f"{x:.9g}" for x in row) for row in np.atleast_2d(matrix))
+
+
+def _as_scan3d(path, lens):
+    """Write what Moreno and Taubin's scan3d-capture does: a MATLAB script with %lf, or OpenCV's YAML."""
+    if path.suffix == ".yml":
+        return _storage(path, cam_K=K, cam_kc=lens[None], proj_K=OTHER, proj_kc=np.zeros((1, 5)), R=np.eye(3),
+                        T=np.ones((3, 1)), cam_error=0.2, proj_error=0.3, stereo_error=0.4)  # fmt: skip
+    lines = ["% Projector-Camera Stereo calibration parameters:", "", "% Intrinsic parameters of camera:"]
+    for side, matrix, terms in (("left", K, lens), ("right", OTHER, np.zeros(5))):
+        lines += [f"fc_{side} = [ {matrix[0, 0]:f} {matrix[1, 1]:f} ]; % Focal Length",
+                  f"cc_{side} = [ {matrix[0, 2]:f} {matrix[1, 2]:f} ]; % Principal point",
+                  f"alpha_c_{side} = [ 0.000000 ]; % Skew",
+                  f"kc_{side} = [ {' '.join(f'{k:f}' for k in terms)} ]; % Distortion"]  # fmt: skip
+    path.write_text("\n".join([*lines, "om = [ 0.1 0.2 0.3 ]; % Rotation vector", "T = [ 1.0 2.0 3.0 ];"]))
+    return path
+
+
+def _as_slstudio(path, lens):
+    """Write what SLStudio does: OpenCV's XML with sizes, a MATLAB script, or names above their rows."""
+    named = {"Kc": K, "kc": lens[:, None], "Kp": OTHER, "kp": np.zeros((5, 1)), "Rp": np.eye(3), "Tp": np.ones((3, 1))}
+    if path.suffix == ".xml":
+        return _storage(path, **named, cam_error=0.2, frameWidth=640, frameHeight=480, screenResX=912, screenResY=1140)
+    if path.suffix == ".m":
+        path.write_text("%%SLStudio calibration\n" + "".join(f"{n} = [{_rows(v)}];\n" for n, v in named.items()))
+        return path
+    rows = (
+        "\n".join(" ".join(f"{x:f}" for x in row) for row in (v.T if v.shape[1] == 1 else v)) for v in named.values()
+    )
+    blocks = (f"{name}\n{text}\n\n" for name, text in zip(named, rows, strict=True))
+    path.write_text("#V1.0 SLStudio calibration\n#Calibration time: today\n\n" + "".join(blocks) + "cam_error: 0.2\n")
+    return path
+
+
+OTHER = np.array([[1100.0, 0, 455.6], [0, 2200.0, 900.4], [0, 0, 1]])  # a projector with diamond pixels
+
+
+@pytest.mark.parametrize(
+    ("write", "name"),
+    [(_as_scan3d, "calibration.yml"), (_as_scan3d, "calibration.m")]
+    + [(_as_slstudio, f"calibration.{ending}") for ending in ("xml", "m", "slcalib")],
+)
+def test_files_of_other_structured_light_programs(tmp_path, write, name):
+    path = write(tmp_path / name, np.append(LENS, 0.0))
+    camera, projector = read_device_file(path, "camera", SIZE), read_device_file(path, "projector", (912, 1140))
+    assert _same_pixels(camera, LENS, 0.5) < 2e-3  # %f keeps six digits after the point
+    np.testing.assert_allclose(projector.parameters[:4], [1100, 2200, 456.1, 900.9], atol=1e-6)
+
+
+def test_matlabs_toolbox_describes_one_camera_with_its_size(tmp_path):
+    path = tmp_path / "Calib_Results.m"
+    path.write_text(
+        "% Intrinsic parameters\nfc = [ 900 ; 905 ];\ncc = [ 322.3 ; 236.8 ];\nalpha_c = 0.0;\n"
+        "kc = [ 0.08 ; -0.12 ; 0.001 ; -0.0007 ; 0 ];\nnx = 640;\nny = 480;\nomc_1 = [ 1e-3 ; 2 ; 3 ];\n"
+    )
+    assert _same_pixels(read_device_file(path, "camera", SIZE), LENS, 0.5) < 1e-9
+    with pytest.raises(UserError, match="calibrated at 640 x 480"):
+        read_device_file(path, "camera", (800, 600))
+
+
+@pytest.mark.parametrize(
+    ("terms", "message"),
+    [
+        ([*LENS, 0, 0, 0, 0, 0.02, 0, 0, 0], r"\(s1 = 0.02\), without which it is .*\n.*thin-prism"),
+        ([*LENS, 0, 0, 0, 0, 0, 0, 0, 0, 0.01, 0], r"tilted \(coefficients 13 and 14, tau x = 0.01"),
+        ([*LENS, 0, 0], "has 6 distortion coefficients, and OpenCV's models have 4, 5, 8, 12 or 14"),
+    ],
+)
+def test_terms_that_a_scan_cannot_express_are_named(tmp_path, terms, message):
+    path = _storage(tmp_path / "c.yml", camera_matrix=K, distortion_coefficients=np.array([terms], dtype=float))
+    with pytest.raises(UserError, match=message) as caught:
+        read_device_file(path, "camera", SIZE)
+    assert "remedy: calibrate" in str(caught.value)
+
+
+def test_terms_beyond_eight_are_those_of_opencv(tmp_path):
+    """A thin prism so weak that its place in the list does not show is absorbed like any other term."""
+    lens = np.array([*LENS, 0, 0, 0, 0, 2e-4, 0, -1e-4, 0, 0, 0])
+    path = _storage(tmp_path / "c.yml", camera_matrix=K, distortion_coefficients=lens[None])
+    assert _same_pixels(read_device_file(path, "camera", SIZE), lens, 0.5) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("c.m", "fc = [ 900 x ];"), ("c.m", "disp hello"), ("c.slcalib", "Kc\n1 2 3\n4 5\n"), ("c.slcalib", "")],
+)
+def test_other_scripts_are_refused(tmp_path, name, content):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(UserError, match=r"cannot be read as|is empty") as caught:
+        read_device_file(tmp_path / name, "camera", SIZE)
+    assert "remedy:" in str(caught.value)

@@ -202,6 +202,7 @@ def test_what_cannot_be_evaluated_is_named_and_nothing_is_written(
     }  # fmt: skip
     for name, values in arrays.items():
         np.savez(f"{name}.npz", **values)
+    np.save("points.npy", np.zeros((200, 3)))
     before = sorted(tmp_path.rglob("*"))
     expect_refusals(
         main, "sl-eval", ["--mesh", "scan/ground_truth/mesh.ply", "--data", "scan"],

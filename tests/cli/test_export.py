@@ -268,7 +268,7 @@ def test_a_texture_without_pictures_says_what_to_add(scan, tmp_path):
 
 def test_flags_that_cannot_be_are_all_named_before_anything_slow(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for name in ("old.ply", "refined/training.json", "colmap/images.txt", "mesh.mtl", "mesh.png"):
+    for name in ("run.yml", "old.ply", "refined/training.json", "colmap/images.txt", "mesh.mtl", "mesh.png"):
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("mine")
     Path("folder.ply").mkdir()
@@ -279,13 +279,13 @@ def test_flags_that_cannot_be_are_all_named_before_anything_slow(tmp_path, monke
         "--resolution", 1, "--cameras", "colmap",
     )  # fmt: skip
     expect_refusals(
-        main, "sl-export", ["--load-config", "missing.yml"],
+        main, "sl-export", ["--load-config", "run.yml"],
         ["--output", "new.stp"], ["--output", "old.ply"], [*new, "--poses", "refined"],
         ["--output", "folder.ply", "--overwrite"], ["--output", "old.ply/deeper/mesh.ply"],
         ["--output", "mesh.obj", *wrong], [*new, "--points", "new.ply"], [*new, "--texture", 2048],
         ["--output", "new.stl", "--texture", 2048], ["--output", "new.glb", "--texture", 63],
         ["--output", "mesh.obj", "--overwrite", "--texture", 8193], ["--output", "mesh.obj", "--texture", 512],
-        [*new, "--poses", "new.ply/refined"], new,
+        [*new, "--poses", "new.ply/refined"], new, [*new, "--load-config", "missing.yml"],
     )  # fmt: skip
     assert sorted(tmp_path.rglob("*")) == before
     for flags in ({"output": Path("old.ply"), "overwrite": True}, {"output": Path("mesh.glb"), "texture": 64}):

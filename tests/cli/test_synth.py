@@ -28,6 +28,11 @@ def test_scans_and_captures_are_written_and_the_next_command_is_one_that_can_wor
     said.append(succeed(main, "sl-synth", "--output", "coded", *SMALL, "--images-only").out)
     words = shlex.split(said[2].partition("next:")[2].replace("\\\n", ""))
     assert words[0] == "sl-process" and all(Path(word).exists() for word in words[2:8:2])
+    said.append(succeed(main, "sl-synth", "--output", "board", *SMALL, "--scene", "chessboard", "--frames", 3).out)
+    words = shlex.split(said[3].partition("next:")[2].replace("\\\n", ""))
+    assert words[0] == "sl-calibrate" and all(
+        Path(words[words.index(f) + 1]).exists() for f in ("--images", "--pattern")
+    )
     expect("sl-synth", "run", "".join(said))
 
 

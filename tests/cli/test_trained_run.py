@@ -176,6 +176,25 @@ def test_a_moved_scan_is_asked_for(copy, scan_root):
         load_run(copy, Path("elsewhere"))
 
 
+def test_a_moved_scan_is_asked_for_by_nerfstudios_commands_too(copy, scan_root, capsys):
+    """Their --load-config takes all settings from config.yml: what they say must work without it."""
+    settings = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
+    dataparser = settings.pipeline.datamanager.dataparser
+    for place in (settings, settings.pipeline.datamanager, dataparser):
+        place.data = Path("/gone/for good")
+    settings.last_step = 60
+    with pytest.raises(SystemExit):
+        settings.set_timestamp()  # ns-train
+    said = capsys.readouterr().err
+    assert said.startswith("error: /gone/for good: has no transforms.json") and "Traceback" not in said
+    assert "remedy: with its folder: ns-train sl-neus --data FOLDER --load-dir" in said
+    assert said.rstrip().endswith("--max-num-iterations 21")
+    with pytest.raises(
+        UserError, match=r"/gone/for good: has no transforms.json(.|\n)*ln -s NEW-PLACE '/gone/for good'"
+    ):
+        _ = dataparser.setup().loaded  # ns-eval, ns-render, ns-viewer
+
+
 def without_checkpoint(run: Path) -> None:
     shutil.rmtree(run / "nerfstudio_models")
     changed_config(run, lambda settings: setattr(settings, "experiment_name", "another"))

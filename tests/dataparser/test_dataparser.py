@@ -303,6 +303,6 @@ def test_poses_that_look_away_are_rejected_with_the_likely_cause(tmp_path: Path)
     scan = dataclasses.replace(
         scan, frames=tuple(dataclasses.replace(f, T_world_camera=T) for f, T in zip(scan.frames, turned, strict=True))
     )
-    with pytest.raises(UserError, match=r"only \d+ of \d+ pixels .*OpenCV axes.*sl-check"):
+    with pytest.raises(UserError, match=r"only \d+ of \d+ pixels .*OpenCV axes.*sl-process"):
         normalisation(scan, build_samples(scan))
     assert json.loads((root / "transforms.json").read_text())["sl_format"] == 1

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.decoding.decoder import DecodingError
-from sl_nerfstudio.decoding.decoders import DECODERS, choose_decoder
+from sl_nerfstudio.decoding.decoders import DECODERS, GrayCodeDecoder, choose_decoder
 from sl_nerfstudio.decoding.gray_code import decode_gray_code
 from sl_nerfstudio.decoding.grid import GridImageDecoder
 from sl_nerfstudio.errors import UserError
@@ -137,3 +137,28 @@ def test_a_broken_file_is_named(tmp_path, name, layout, count):
         path.write_bytes(b"no image")
     with pytest.raises(FileError, match=r"0\.png"):
         DECODERS[name](layout).decode(paths)
+
+
+def test_a_stated_order_is_believed_unless_the_images_show_another(tmp_path):
+    """The camera exposes its brightest image less: white is darker than stripes, and no known order fits."""
+    coords, layout = exact_coords(), GrayCode.in_order("opencv", LAYOUT.w, LAYOUT.h, LAYOUT.cell)
+    images = photographs(coords, layout=layout)
+    images[-2] = (0.6 * images[-2]).astype(np.uint8)
+    paths = write_images(tmp_path, images)
+    with pytest.raises(
+        DecodingError, match=r"not in the order of the sequence.*30\.png \(white\) is not the brightest"
+    ):
+        GrayCodeDecoder(layout).decode(paths)
+    decoded = GrayCodeDecoder(layout, order_stated=True).decode(paths)
+    assert "30.png (white) is not the brightest" in decoded.notes[0] and "in the stated order" in decoded.notes[0]
+    both = decoded.decoded & np.isfinite(coords).all(-1)
+    assert both.mean() > 0.5 and np.median(np.abs(decoded.coords[both] - coords[both])) < 0.1
+    paths = write_images(tmp_path, photographs(coords, layout=layout))
+    for stated in (False, True):
+        with pytest.raises(DecodingError, match="in the order of opencv, procam, not of sl-pattern") as caught:
+            GrayCodeDecoder(LAYOUT, stated).decode(paths)
+        assert caught.value.remedy == "give --sequence opencv"
+    mirrored = write_images(tmp_path, [image[:, ::-1] for image in photographs(coords, layout=layout)])
+    with pytest.raises(DecodingError, match="as in a mirror") as caught:
+        GrayCodeDecoder(layout, order_stated=True).decode(mirrored)
+    assert "from rear to front projection" in caught.value.remedy

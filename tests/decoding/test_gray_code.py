@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.decoding.decoder import DecodingError, drop_small_regions
-from sl_nerfstudio.decoding.gray_code import decode_gray_code
+from sl_nerfstudio.decoding.gray_code import decode_gray_code, take_samples
+from sl_nerfstudio.decoding.gray_code_order import check_order
 from sl_nerfstudio.pattern.gray_code import GrayCode
-from tests.decoding.gray_captures import LAYOUT, exact_coords, photographs
+from tests.decoding.gray_captures import LAYOUT, exact_coords, figure_before_wall, photographs
 
 COORDS = exact_coords()
 LIT = np.isfinite(COORDS).all(-1)
@@ -88,6 +89,38 @@ def test_cells_smaller_than_a_pixel_of_the_camera_take_the_mean_of_cells():
     both = decoded.decoded & np.isfinite(coords).all(-1)
     assert both.sum() > 0.5 * np.isfinite(coords).all(-1).sum()
     assert np.median(np.abs(decoded.coords[both] - coords[both])) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("light", "size", "note", "largest_error"),
+    [
+        ({"blur": 1.0}, 2, "decoded to 2 px", 0.03),  # the finest stripes have a contrast of about 10 %
+        ({"blur": 3.0}, 4, "decoded to 4 px", 0.2),
+        ({"gain": 3.0, "blur": 0.8}, 1, "overexposed", 0.05),
+    ],
+)
+def test_stripes_that_are_not_resolved_are_not_used_and_overexposure_is_named(light, size, note, largest_error):
+    coords, layout = exact_coords(400, 300), GrayCode(640, 480, 1)
+    decoded = decode_gray_code(photographs(coords, layout=layout, **light), layout)
+    assert [text for text in decoded.notes if text.startswith(note)] and len(decoded.notes) == 1
+    both = decoded.decoded & np.isfinite(coords).all(-1)
+    error = np.abs(decoded.coords[both] - coords[both])
+    assert both.sum() > 0.95 * np.isfinite(coords).all(-1).sum()
+    assert np.median(error) < largest_error and (error.max(1) < 1.5 * size).mean() > 0.99
+
+
+def test_a_textured_figure_before_a_wall():
+    """Colour photographs of which a comparison of each image with its inverse alone gives the wall to 0.8 px."""
+    layout = GrayCode.in_order("opencv", 1280, 800, 1)
+    images, coords, wall = figure_before_wall(layout)
+    assert check_order(take_samples(images), layout).fits
+    decoded = decode_gray_code(images, layout)
+    assert "decoded to 4 px along x and 2 px along y" in decoded.notes[0]
+    for part, share, largest in ((wall, 0.99, 0.12), (~wall, 0.97, 0.3)):
+        both = decoded.decoded & part
+        error = decoded.coords[both] - coords[both]
+        assert both.sum() > share * part.sum()
+        assert np.sqrt(np.median(error**2, 0)).max() < largest and (np.abs(error).max(1) > 6).mean() < 3e-3
 
 
 def test_a_turned_camera_makes_no_difference(images, decoded):

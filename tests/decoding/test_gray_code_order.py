@@ -5,6 +5,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -32,6 +33,7 @@ KINDS = [
     GrayCode.in_order("phase-gray", *SIZE, 16),
     GrayCode.in_order("phase-gray", *SIZE, 8, (16.0, 32.0)),
     GrayCode.in_order("slstudio", *SIZE, 1, (20.0, 15.0)),
+    GrayCode.in_order("scan3d-capture", *SIZE, 1),  # columns in cells of 2, numbered from 96; rows from 8
 ]
 kinds = pytest.mark.parametrize("layout", KINDS, ids=lambda layout: f"{layout.order} {layout.cell}")
 
@@ -90,6 +92,7 @@ def test_misplaced_images_are_named_by_their_place():
         (lambda i: i[18:], "stripes in one direction only"),
         (lambda i: [i[-1]] * 36, "shows no stripes"),
         (lambda i: [*i[:-1], i[-1][:-3]], "several sizes"),
+        (lambda i: [cv2.multiply(x, 6) for x in _exchanged(i, 3, 10)], r"overexposed \(\d\d% of the lit .* image 10"),
         (lambda i: _exchanged(i, 3, 10), r"nearest is opencv, procam .*image 2 \(x bit 7\) .*image 3 .*image 10"),
     ],
 )
@@ -97,6 +100,20 @@ def test_what_is_not_recognised_is_explained(change, message):
     with pytest.raises(DecodingError, match=message) as caught:
         layout_of_images(change(pictures(1)), SIZE)
     assert caught.value.cause and caught.value.remedy
+
+
+@pytest.mark.parametrize("named", ["opencv", None])
+def test_cells_numbered_from_the_middle_are_recognised_by_codes_that_would_lie_outside(named):
+    size = (320, 200)
+    layout = replace(GrayCode.in_order("opencv", *size, 1), centred=True)
+    coords = COORDS * (1, 200 / 240)
+    images = photographs(coords, layout=layout)
+    assert layout_of_images(images, size, named) == layout
+    decoded = decode_gray_code(images, layout)
+    both = decoded.decoded & LIT
+    assert both.sum() > 0.97 * LIT.sum() and np.median(np.abs(decoded.coords[both] - coords[both])) < 0.1
+    plain = replace(layout, centred=False)
+    assert layout_of_images(photographs(coords, layout=plain), size, named) == plain
 
 
 def test_what_fits_several_sequences_is_refused():
@@ -123,6 +140,25 @@ def test_real_sequences_are_recognised():
     for folder, size, name, cell in sets:
         images = [read_image(path) for path in sorted((root / folder).glob("*.jpg"))]
         assert layout_of_images(images, size) == GrayCode.in_order(name, *size, cell)
+
+
+def test_real_photographs_whose_finest_stripes_are_blurred():
+    """Half the size and a blur of 1 px leave the finest stripes 3 % of contrast, and the next ones 34 %."""
+    root = Path(os.environ.get("SL_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
+    if not (root / "house_gray").is_dir():
+        pytest.skip(f"no real captures at {root} (set SL_REAL_DATA)")
+    from sl_nerfstudio.scan.images import read_image
+
+    layout = GrayCode.in_order("sl-pattern", 1920, 1080, 2)
+    images = [read_image(path) for path in sorted((root / "house_gray" / "view0").glob("*.jpg"))]
+    half = [cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for image in images]
+    half = [cv2.GaussianBlur(image, (0, 0), 1.0) for image in half]
+    assert check_order(take_samples(half), layout).fits
+    decoded = decode_gray_code(half, layout)
+    assert decoded.notes[0].startswith("decoded to 4 px:") and decoded.rate > 0.92
+    exchanged = _exchanged(_exchanged(half, 4, 6), 5, 7)
+    found = check_order(take_samples(exchanged), layout).misplaced
+    assert found[0].expected in ("x bit 8", "x bit 7") and found[0].seen == "does not continue the coarser bits"
 
 
 def test_lists_of_a_kind_of_its_own_are_decoded():

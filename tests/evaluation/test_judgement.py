@@ -8,7 +8,14 @@ import pytest
 from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement
 from sl_nerfstudio.evaluation.completeness import NextView, assess_completeness
 from sl_nerfstudio.evaluation.evaluate import Evaluation
-from sl_nerfstudio.evaluation.judgement import TrainedSteps, capture_next, disagreeing_frames, judge, trained_steps
+from sl_nerfstudio.evaluation.judgement import (
+    TrainedSteps,
+    capture_next,
+    disagreeing_frames,
+    further_commands,
+    judge,
+    trained_steps,
+)
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.review.verdict import DepartedFrame
 from tests.review.cases import ring
@@ -32,7 +39,7 @@ def test_what_is_wrong_with_the_intrinsics_comes_first() -> None:
     poor = judge(
         replace(GOOD, starting_poses=False, agreement=replace(AGREEMENT, hit_share=0.5)), "The camera is too long"
     )
-    assert poor.next_steps[0] == "The camera is too long" and poor.next_steps[1].startswith("Coverage")
+    assert poor.next_steps == ["The camera is too long"] and poor.verdict.reasons[0].startswith("Coverage")
     assert judge(GOOD, "The camera is too long").next_steps == ["The camera is too long"]
 
 
@@ -83,9 +90,9 @@ def test_frames_that_contradict_each_other_are_named_as_in_a_processing_report()
         (_with(coordinate_px_median=3.5), "Worst frame", "poor"),
         (_with(coordinate_px_p95=4.0), "Worst frame, 95 %", "acceptable"),
         (_with(agreeing_share=0.5), "Agreement in the worst frame", "poor"),
-        (_with(covered_share=0.8), "Coverage of the worst frame", "acceptable"),
-        (_with(largest_hole=0.01), "Largest hole", "acceptable"),
-        (_with(largest_hole=0.05), "Largest hole", "poor"),
+        (_with(covered_share=0.8), "Coverage", "acceptable"),
+        (_with(largest_hole=0.01), "Coverage", "acceptable"),
+        (_with(largest_hole=0.05), "Coverage", "poor"),
     ],
 )
 def test_the_worst_figure_decides_and_says_what_to_do(change: dict, check: str, band: str) -> None:
@@ -97,11 +104,38 @@ def test_the_worst_figure_decides_and_says_what_to_do(change: dict, check: str, 
     else:
         assert verdict.verdict.band == band
         assert verdict.verdict.reasons[0].startswith(f"{check}: ")
+        assert verdict.verdict.reasons[0].endswith(judged[check].advice) and judged[check].advice
+        assert len([reason for reason in verdict.verdict.reasons if reason.startswith(f"{check}:")]) == 1
         assert verdict.next_steps[0].startswith("These figures are for the scan's starting poses")
-        assert verdict.next_steps[1].startswith(check)
     if "frames" in change:
-        assert "frame_00007" in verdict.verdict.reasons[0]
-        assert "frame_00007" in judged[check].text and "frame_00007" in judged[check].advice
+        assert "frame_00007" in verdict.verdict.reasons[0] and "frame_00007" in judged[check].text
+
+
+TRAIN, EXPORT = ["ns-train", "sl-neus", "--data", "my scan"], ["sl-export", "--resolution", "1024"]
+
+
+@pytest.mark.parametrize(("step", "train"), [(9, True), (999, False), (1500, False)])
+def test_only_an_unfinished_training_is_to_be_trained_further_and_with_a_command(step: int, train: bool) -> None:
+    training = {
+        "settings": {"step": step, "recommended_steps": 1000},
+        "commands": {"train": TRAIN, "export": EXPORT},
+    }
+    lacking = replace(GOOD, agreement=replace(AGREEMENT, hit_share=0.5, coordinate_px_median=3.0))
+    found = judge(lacking, steps=trained_steps(training), commands=further_commands(training)).verdict.reasons
+    said = "train to the end: ns-train sl-neus --data 'my scan'"
+    coverage, residual = (next(r for r in found if r.startswith(name)) for name in ("Coverage", "Coordinate residual"))
+    assert coverage.endswith(said if train else "export with finer cells: sl-export --resolution 1024")
+    assert (said in residual) == train and ("train to the end" in " ".join(found)) == train
+    assert "--resolution 1024" in further_commands(None).for_missing_surface
+
+
+def test_every_reason_says_what_helps_and_no_unit_is_called_arbitrary() -> None:
+    bad = replace(FRAME, name="frame_00007", coordinate_px_median=3.5, coordinate_px_p95=9.0, agreeing_share=0.1)
+    fit = CaptureAgreement(3.0, 9.0, 2.0, 0.3, 0.5, 0.00546, 2.0, (*[FRAME] * 5, bad))
+    verdict = judge(replace(GOOD, units="arbitrary", agreement=fit), length_sigma=0.1)
+    assert len(verdict.verdict.reasons) == 9 and all("; " in reason for reason in verdict.verdict.reasons)
+    assert not any("arbitrary" in figure.meaning + figure.text for figure in verdict.figures)
+    assert any("0.00546 units of depth" in figure.meaning for figure in verdict.figures)
 
 
 def test_without_a_unit_the_scale_is_not_an_error() -> None:
@@ -154,7 +188,7 @@ def test_holes_and_missing_surface_are_judged():
     found = assess_completeness(IndexedMesh(cut_sphere(0.5, -0.5)), agreement)
     assert found.observed == pytest.approx(0.98) and found.hole_share == pytest.approx(0.75 / 2, rel=0.05)
     judged = {f.name: f for f in judge(replace(REFINED, agreement=agreement, completeness=found)).figures}
-    assert judged["Observed surface"].band == "acceptable" and judged["Observed surface"].text == "98.0 % present"
+    assert judged["Coverage"].band == "acceptable" and "98.0 % of what the frames decoded" in judged["Coverage"].text
     assert judged["Holes"].band == "acceptable" and "openings: 2, 4." in judged["Holes"].text
     assert judged["Holes"].acceptable == "any"  # nobody can judge what nobody saw
     closed = assess_completeness(IndexedMesh(cut_sphere()), REFINED.agreement)

@@ -162,7 +162,7 @@ def test_field_gets_float32_points_inside_the_box_in_bounded_chunks():
 @pytest.mark.parametrize(
     ("field", "resolution", "message"),
     [
-        (lambda p: torch.full_like(p[:, 0], 0.7), 32, r"no zero level.*positive everywhere.*ns-viewer.*sl-check"),
+        (lambda p: torch.full_like(p[:, 0], 0.7), 32, r"no zero level.*positive everywhere.*last step.*sl-process"),
         (lambda p: torch.full_like(p[:, 0], -0.7), 32, r"no zero level.*negative everywhere"),
         (
             lambda p: torch.where(p[:, 0] > 0.5, torch.nan, sphere(p)),

@@ -281,6 +281,8 @@ def test_las_is_in_metres_with_normals_sigma_and_views(cloud, units, tmp_path):
     write_points(tmp_path / "cloud.las", *cloud, units)
     found = laspy.read(tmp_path / "cloud.las")
     np.testing.assert_allclose(found.xyz, VERTICES[VIEWS > 0] * METRES[units], rtol=1e-7)
+    decimals = np.log10(found.header.scales)
+    np.testing.assert_allclose(decimals, np.round(decimals), atol=1e-9)  # what other programs show in full
     normals = np.stack([found["nx"], found["ny"], found["nz"]], 1)
     np.testing.assert_allclose(normals, CORNER.vertex_normals()[VIEWS > 0], atol=1e-7)
     np.testing.assert_allclose(found["sigma"], SIGMA[VIEWS > 0] * METRES[units], rtol=1e-6)

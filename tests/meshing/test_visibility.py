@@ -488,7 +488,7 @@ def test_wrong_poses_say_so(truth, ball_scan):
     with pytest.raises(
         UserError,
         match=r"the frames observed no part(.|\n)*no vertex that faces camera and projector is inside a mask"
-        r"(.|\n)*sl-check(.|\n)*--keep-unobserved",
+        r"(.|\n)*last step(.|\n)*sl-process(.|\n)*--keep-unobserved",
     ):
         poses = DevicePoses(
             ball_scan.poses.T_world_camera @ upside_down, ball_scan.poses.T_world_projector @ upside_down

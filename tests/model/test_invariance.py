@@ -33,7 +33,7 @@ def surface(folder: Path) -> np.ndarray:
     """Vertices of the observed surface after a short run, in world units."""
     loaded = load_scan(folder)
     config = SLModelConfig(schedule_iterations=STEPS)
-    config.adjustment = replace(config.adjustment, anchors_per_frame=100, other_minima=0, hops=0)
+    config.adjustment = replace(config.adjustment, anchors_per_frame=100, further_searches=False, other_minima=False)
     config.sdf.levels, config.sdf.max_resolution, config.sdf.hidden = 3, 64, 32
     torch.manual_seed(0)
     box = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))

@@ -30,3 +30,9 @@ def test_a_scan_with_much_missing_is_to_be_decoded_again() -> None:
     text = what_next(Path("/run/config.yml"), Path("/scans/a vase"), 0.404)
     assert "40% of the pixels" in text and "--output '/scans/a vase-again'" in text
     assert max(map(len, text.splitlines())) <= 80
+
+
+def test_a_scan_that_was_decoded_again_is_not_sent_in_a_circle(tmp_path: Path) -> None:
+    assert "sl-redecode" in what_next(Path("/run/config.yml"), tmp_path, 0.404)
+    (tmp_path / "redecoding.json").touch()
+    assert "sl-redecode" not in what_next(Path("/run/config.yml"), tmp_path, 0.404)

@@ -45,8 +45,8 @@ QUICK = AdjustmentSettings(
     anchors_per_frame=80,
     frames_per_anchor=3,
     max_iterations=14,
-    hops=0,
-    other_minima=0,
+    further_searches=False,
+    other_minima=False,
 )
 
 

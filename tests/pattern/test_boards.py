@@ -87,7 +87,7 @@ def test_boards_that_cannot_be(make, message):
 
 
 @pytest.mark.parametrize(
-    ("text", "mm"), [("75 mm", 75), ("7.5cm", 75), (".075 m", 75), ("1 in", 25.4), ("5 um", 0.005)]
+    ("text", "mm"), [("75 mm", 75), ("7.5cm", 75), (".075 m", 75), ("1 in", 25.4), ("2 inch", 50.8), ("5 um", 0.005)]
 )
 def test_lengths(text, mm):
     assert millimetres(text, "--square") == pytest.approx(mm)

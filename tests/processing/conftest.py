@@ -12,7 +12,7 @@ from tests.processing.ramp_scan import RampScan, make_ramp_scan
 
 # For tests of what is made of an adjustment: rough, and without the question whether there are other minima.
 SHORT = RegisteredFramesSettings(
-    adjustment=AdjustmentSettings(anchors_per_frame=200, max_iterations=16, other_minima=0)
+    adjustment=AdjustmentSettings(anchors_per_frame=200, max_iterations=16, other_minima=False)
 )
 
 

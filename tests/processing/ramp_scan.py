@@ -56,9 +56,9 @@ def make_ramp_scan(root: Path) -> RampScan:
     return make_captures(root, *_rendered())
 
 
-def make_captures(root: Path, setup: Setup, coords: Sequence[np.ndarray]) -> RampScan:
+def make_captures(root: Path, setup: Setup, coords: Sequence[np.ndarray], names: Sequence[str] = NAMES) -> RampScan:
     """The captures of the first frames of a setup, from their exact coordinates."""
-    for name, uv in zip(NAMES, coords, strict=True):
+    for name, uv in zip(names, coords, strict=True):
         folder = root / "images" / name
         folder.mkdir(parents=True)
         for axis, size in enumerate((LAYOUT.w, LAYOUT.h)):
@@ -68,4 +68,4 @@ def make_captures(root: Path, setup: Setup, coords: Sequence[np.ndarray]) -> Ram
     camera, projector = setup.devices.camera, setup.devices.projector
     document = {"camera": device_fields(camera, "model"), "projector": device_fields(projector, "model")}
     (root / "intrinsics.json").write_text(json.dumps(document))
-    return RampScan(root, camera, projector, setup.truth.T_world_camera[: len(NAMES)], tuple(coords))
+    return RampScan(root, camera, projector, setup.truth.T_world_camera[: len(names)], tuple(coords))

@@ -1,7 +1,9 @@
 """Captures are found in their order and with their pattern; faulty ones are named with all their faults."""
 
 import json
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from PIL import Image
 from sl_nerfstudio.calibration.formats import camera_names, read_device_file
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.gray_code import GrayCode
-from sl_nerfstudio.processing.captures import find_captures, incomplete
+from sl_nerfstudio.processing.captures import describe_faults, find_captures, incomplete
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.inputs import read_captured
 from sl_nerfstudio.scan.images import encode_png
@@ -56,10 +58,42 @@ def test_images_of_another_size_and_unreadable_ones_are_faults_of_their_frames(t
     assert all("remedy:" in text for text in (turned, empty, large))
 
 
+def test_all_files_with_the_same_fault_are_named_together(tmp_path):
+    for k in range(4):
+        _write(tmp_path / f"f{k}.png")
+    _write(tmp_path / "hidden.png", 8, 6)
+    for name in ("cut1.png", "cut2.png"):
+        Image.new("RGBA", (16, 12), (9, 9, 9, 100)).save(tmp_path / name)
+    sentences = describe_faults(find_captures(tmp_path, sequences=False))
+    assert len(sentences) == 2
+    assert "cut1.png: is transparent in places (and so is cut2.png)" in sentences[0]
+    assert "hidden.png: is 8 x 6 pixels, most images are 16 x 12" in sentences[1]
+    for k in range(4):
+        (tmp_path / f"f{k}.png").unlink()
+    (tmp_path / "hidden.png").unlink()
+    with pytest.raises(UserError, match=r"cut1.png: is transparent in places \(and so is cut2.png\)"):
+        find_captures(tmp_path, sequences=False)
+    for k in range(8):
+        _write(tmp_path / "sequence" / f"{k}.png", mode="RGBA" if k else "L")  # transparent
+        _write(tmp_path / "whole" / f"{k}.png")
+    fault = find_captures(tmp_path, sequences=True).faults["sequence"]
+    assert "has 7 faults: 1.png, 2.png, 3.png, 4.png, 5.png and 2 more: each is transparent in places" in str(fault)
+
+
 @pytest.mark.parametrize(
     ("sequences", "files", "message"),
     [
         (False, ["a.png"], "holds 1 images; a scan needs at least 2 frames"),
+        (
+            False,
+            ["images/1.png", "images/2.png"],
+            r"holds its captures in a folder of its own, images(.*\n)*.*/images$",
+        ),
+        (
+            True,
+            ["images/p/1.png", "images/q/1.png"],
+            r"in a folder of its own, images(.*\n)*.*give --images .*/images$",
+        ),
         (False, ["x/1.png", "y/1.png"], "holds 0 images.*\n.*do not suit the pattern: a coded grid needs"),
         (True, ["1.png", "2.png"], "holds 0 folders with images.*\n.*do not suit the pattern"),
         (False, ["a.png", "a.jpg", "b.png"], "several images named a"),
@@ -103,8 +137,6 @@ def config(tmp_path, **changes):
 
 
 def test_the_order_is_recognised_and_reported(tmp_path, sequence):
-    from pathlib import Path
-
     for name in ("a", "b"):
         write(tmp_path / "images" / name, sequence)
     captured = read_captured(config(tmp_path, pattern=Path("320x240"), intrinsics=tmp_path / "i.yml"))
@@ -170,3 +202,40 @@ def test_a_video_of_gray_code_is_refused(tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"x")
     with pytest.raises(UserError, match=r"v.mp4: is a video, and Gray code needs one image for each pattern"):
         read_captured(config(tmp_path, images=tmp_path / "v.mp4", pattern=tmp_path / "p.json"))
+
+
+def flat(size, part):
+    """Exact coordinates of a board tilted before the projector, from `part` shares of each side to one less of it."""
+    x, y = np.meshgrid(np.linspace(-0.08, 1.08, 260), np.linspace(-0.08, 1.08, 220))
+    u, v = size[0] * (x + 0.04 * (y - 0.5)), size[1] * (y - 0.03 * (x - 0.5))
+    coords = np.stack([u, v], -1)
+    low, high = np.multiply(size, part), np.multiply(size, 1 - part)
+    coords[((coords < low) | (coords > high)).any(-1)] = np.nan
+    return coords
+
+
+WRONG = [((640, 480, 2), "800x600"), ((640, 480, 2), "640x400"), ((1280, 800, 4), "1024x768")]
+
+
+@pytest.mark.parametrize(("true", "stated"), WRONG)
+def test_a_resolution_that_the_codes_exclude_is_refused_and_the_likely_one_named(tmp_path, true, stated):
+    layout = GrayCode(*true)
+    for name in ("a", "b"):
+        write(tmp_path / "images" / name, photographs(flat(true[:2], 0), layout=layout))
+    given = config(tmp_path, intrinsics=tmp_path / "i.yml")
+    with pytest.raises(UserError, match=f"--pattern {true[0]}x{true[1]}, or the pattern.json") as caught:
+        read_captured(replace(given, pattern=Path(stated)))
+    said = str(caught.value)
+    assert str(tmp_path / "images" / "a") in said and f"{stated.replace('x', ' x ')} pixels" in said
+    columns, rows = map(int, re.search(r"shows (\d+) columns and (\d+) rows of cells", said).groups())
+    assert layout.columns - 3 <= columns <= layout.columns and layout.rows - 3 <= rows <= layout.rows
+    captured = read_captured(replace(given, pattern=Path(f"{true[0]}x{true[1]}")))
+    assert captured.decoder.layout == layout
+
+
+def test_a_board_in_part_of_the_pattern_says_nothing_against_the_resolution(tmp_path):
+    layout = GrayCode(640, 480, 2)
+    for name in ("a", "b"):
+        write(tmp_path / "images" / name, photographs(flat((640, 480), 0.2), layout=layout))
+    given = config(tmp_path, pattern=Path("640x480"), intrinsics=tmp_path / "i.yml")
+    assert read_captured(given).decoder.layout == layout

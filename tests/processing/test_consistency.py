@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.bundle_adjustment import adjust as adjustment
-from sl_nerfstudio.bundle_adjustment import search as one_search
+from sl_nerfstudio.bundle_adjustment import modes
 from sl_nerfstudio.bundle_adjustment.registered_frames import (
     RegisteredFramesSettings,
     adjust_registered,
@@ -49,13 +49,8 @@ RIG = part_of(rig_of(18, SIZE), list(range(FRAMES)))
 NAMES = tuple(f"frame_{k:05d}" for k in range(FRAMES))
 
 
-QUICK = RegisteredFramesSettings(adjustment=AdjustmentSettings(anchors_per_frame=120, max_iterations=12))
-
-
-def search_briefly(monkeypatch) -> None:
-    """Place lost frames once, from one start."""
-    monkeypatch.setattr(one_search, "_ROUNDS", 1)
-    monkeypatch.setattr(one_search, "_STARTS", 1)
+BRIEF = AdjustmentSettings(anchors_per_frame=120, max_iterations=12, further_searches=False)
+QUICK = RegisteredFramesSettings(adjustment=BRIEF)
 
 
 @pytest.fixture(autouse=True)
@@ -182,7 +177,6 @@ def test_a_frame_that_contradicts_again_where_it_was_placed_is_not_placed_a_thir
         return without_groups(true, [[k] for k in registration_gaps(registration) if k not in candidates])
 
     monkeypatch.setattr(consistency, "include_left_out", all_of_them)
-    search_briefly(monkeypatch)
     log = []
     found = adjust_consistent(with_stranger(clouds), without_groups(true, [[1]]), log.append, QUICK)
     assert asked == [[1, MOVED]]
@@ -238,14 +232,14 @@ def test_other_minima_are_searched_for_once_and_the_last_group_states_what_they_
     """On a plane along which frames slide; a stranger among them makes two adjustments of it."""
     monkeypatch.setattr(analytic, "BALLS", ())
     clouds, starts = with_stranger(clouds_of(RIG, SIZE, noise=0.02)), []
-    search_briefly(monkeypatch)
     search = adjustment.search
-    monkeypatch.setattr(adjustment, "search", lambda problem, *rest: starts.append(problem) or search(problem, *rest))
+    for module in (adjustment, modes):
+        monkeypatch.setattr(module, "search", lambda problem, *rest: starts.append(problem) or search(problem, *rest))
     monkeypatch.setattr(consistency, "include_left_out", lambda clouds, registration, *_: registration)
     found = adjust_consistent(clouds, registration_of(RIG.T_world_camera.numpy()), lambda _: None, QUICK)
     kept = [k for k in range(FRAMES) if k != MOVED]
     assert np.flatnonzero(found.registration.registered).tolist() == kept
-    assert [p.start.frames for p in starts] == [FRAMES, *[FRAMES - 1] * (1 + QUICK.adjustment.other_minima)]
+    assert [p.start.frames for p in starts] == [FRAMES, *[FRAMES - 1] * (1 + modes._DRAWN)]
     wanted = adjust_registered(clouds, found.registration, QUICK)
     alone = find_registered_minimum(clouds, found.registration, QUICK).frames
     np.testing.assert_array_equal(found.adjusted.poses.T_world_camera, wanted.poses.T_world_camera)

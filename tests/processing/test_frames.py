@@ -21,7 +21,14 @@ from sl_nerfstudio.cli.process import main
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing import frames, records
 from sl_nerfstudio.processing.captures import find_captures
-from sl_nerfstudio.processing.frames import FrameWorker, clouds_of, describe_frame_stage, run_frame_stage, run_frames
+from sl_nerfstudio.processing.frames import (
+    FrameWorker,
+    capture_sentences,
+    clouds_of,
+    describe_frame_stage,
+    run_frame_stage,
+    run_frames,
+)
 from sl_nerfstudio.processing.records import digest
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png
@@ -295,3 +302,9 @@ def test_no_more_processes_are_started_than_there_is_memory_for(monkeypatch, meg
     found = frames.default_processes(int(megapixels * 1e6), gigabytes * 10**9)
     assert found == expected
     assert found == 1 or found * (1.4 + 0.2 * megapixels) + 1 < gigabytes
+
+
+def test_what_the_decoder_noted_is_said_once_with_its_frames():
+    noted = [("f0", ()), ("f1", ("decoded to 4 px", "overexposed")), ("f2", ("decoded to 4 px",))]
+    assert capture_sentences(noted) == ["f1, f2: decoded to 4 px", "f1: overexposed"]
+    assert capture_sentences(noted[1:]) == ["all: decoded to 4 px", "f1: overexposed"]

@@ -14,10 +14,11 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
 from sl_nerfstudio.processing import frames
 from sl_nerfstudio.processing import process as stages
-from sl_nerfstudio.processing.cache import VERSIONS
+from sl_nerfstudio.processing.cache import MOST_KEPT, VERSIONS
 from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.process import process
 from sl_nerfstudio.processing.records import digest
+from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.storage import LOCK, NewFolder, locked
 from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import NAMES
@@ -79,12 +80,11 @@ def test_killed_at_any_moment_the_next_run_ends_with_the_same_bytes(whole, confi
     assert [line for line in log if line in KEPT] == KEPT and "4 had been decoded before" in "".join(log)
     kept, expected = content(config.work_folder), content(whole / "s.work")
     assert kept.keys() == expected.keys()
-    assert all(kept[name] == expected[name] for name in kept if name != "manifest.json")
+    assert all(kept[name] == expected[name] for name in kept if name not in ("manifest.json", "scans.json"))
 
 
 def test_nothing_is_computed_again(whole, resumed, monkeypatch):
-    for module, name in ((stages, "register"), (stages, "adjust_consistent"), (frames, "estimate_relative_pose")):
-        monkeypatch.setattr(module, name, lambda *_, name=name: pytest.fail(f"{name} was called again"))
+    nothing_slow(monkeypatch)
     run(resumed)
     assert content(resumed.output) == content(whole / "s")
 
@@ -130,11 +130,86 @@ def test_two_runs_in_one_place_are_refused(config):
     assert not config.work_folder.exists()
 
 
-def test_the_work_folder_may_not_be_in_the_output(config):
+def test_outputs_are_not_in_each_other_and_not_among_the_captures(config):
     for work in (config.output, config.output / "inside", config.output / ".." / config.output.name):
-        with pytest.raises(UserError, match=r"--work .*: is in the output, which is to be a new folder"):
+        with pytest.raises(UserError, match=r"--work .*: is in the output(.|\n)*such as .*scan.work"):
             run(replace(config, work=work))
-    assert not config.output.exists()
+    for inside in (config.images, config.images / "scan"):
+        with pytest.raises(UserError, match=r"--output .*: is in the captures(.|\n)*such as .*/scan$"):
+            run(replace(config, output=inside))
+        with pytest.raises(UserError, match=r"--work .*: is in the captures"):
+            run(replace(config, work=inside))
+    assert not config.output.exists() and not (config.images / "scan").exists()
+
+
+def nothing_slow(monkeypatch):
+    for module, name in ((stages, "register"), (stages, "adjust_consistent"), (frames, "estimate_relative_pose")):
+        monkeypatch.setattr(module, name, lambda *_, name=name: pytest.fail(f"{name} was called again"))
+
+
+def test_another_length_renews_the_scan_and_another_output_uses_what_is_kept(whole, resumed, monkeypatch, tmp_path):
+    run(resumed)
+    nothing_slow(monkeypatch)
+    first, longer = content(resumed.output), replace(resumed, known_length="baseline of frame 1 = 10 cm")
+    log = run(longer)
+    assert f"{resumed.output} holds an earlier scan of the same captures, which this one replaces" in log
+    second = content(resumed.output)
+    assert second.keys() == first.keys() and second["transforms.json"] != first["transforms.json"]
+    assert read_scan(resumed.output).poses.baseline[1] == pytest.approx(10)
+    log = run(replace(resumed, output=tmp_path / "elsewhere" / "t"))
+    assert f"processed before: {resumed.work_folder} has" in log[0] and "4 had been decoded before" in "".join(log)
+    elsewhere = content(tmp_path / "elsewhere" / "t")
+    assert all(elsewhere[name] == first[name] for name in first if name != "processing.html")  # names the work folder
+    assert elsewhere.keys() == first.keys() and not (tmp_path / "elsewhere" / "t.work").exists()
+    run(replace(resumed, output=tmp_path / "elsewhere" / "t"))  # of which the same work folder knows
+
+
+def test_killed_while_a_scan_is_renewed_the_next_run_succeeds(whole, resumed):
+    run(replace(resumed, known_length="baseline of frame 1 = 10 cm"))
+    assert sum(killed(resumed, moment) for moment in (1, 8, 20, 31, 45)) >= 3
+    run(resumed)
+    assert content(resumed.output) == content(whole / "s")
+
+
+@pytest.mark.parametrize(
+    ("change", "cause"),
+    [
+        (lambda out: (out / "transforms.json").write_text("{}"), "transforms.json was changed since"),
+        (lambda out: (out / "notes.txt").touch(), "notes.txt was added since"),
+        (lambda out: next((out / "images").iterdir()).unlink(), "images/.* was removed since"),
+    ],
+)
+def test_a_scan_that_the_user_changed_stays(resumed, change, cause):
+    run(resumed)
+    change(resumed.output)
+    before = content(resumed.output)
+    with pytest.raises(UserError, match=f"s: is not empty(.|\n)*{cause}(.|\n)*choose another output"):
+        run(resumed)
+    assert content(resumed.output) == before
+
+
+def test_a_scan_of_other_captures_stays_and_so_does_any_after_an_error(ramp_scan, resumed, monkeypatch, tmp_path):
+    run(resumed)
+    before = content(resumed.output)
+    shutil.copytree(ramp_scan.root, tmp_path / "c")
+    fewer = replace(resumed, images=tmp_path / "c" / "images", work=resumed.work_folder)
+    shutil.rmtree(fewer.images / NAMES[2])
+    with pytest.raises(UserError, match=r"holds the scan of other captures(.|\n)*added, removed or replaced"):
+        run(fewer)
+    monkeypatch.setattr(stages, "find_scan_poses", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        run(replace(resumed, known_length="baseline of frame 1 = 10 cm"))
+    assert content(resumed.output) == before
+
+
+def test_the_work_folder_keeps_what_was_used_last(resumed):
+    stage = resumed.work_folder / "stages"
+    old = [stage / f"registration-{k:024d}.npz" for k in range(20)]
+    for k, path in enumerate(old):
+        path.touch()
+        os.utime(path, (k, k))
+    run(resumed)
+    assert [path for path in old if path.exists()] == old[1 - MOST_KEPT :]  # and the one that was used
 
 
 def test_temporary_files_of_killed_workers_do_not_stay(resumed):

@@ -17,7 +17,7 @@ from sl_nerfstudio.processing.object_only import (
     object_sentences,
 )
 from sl_nerfstudio.processing.process import process
-from sl_nerfstudio.processing.result import with_object_only
+from sl_nerfstudio.processing.result import without_empty
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.types import PickedPixel, Scale, ScaleBar
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -93,9 +93,9 @@ def test_without_the_flag_the_table_stays(on_a_table, ramps_registered, tmp_path
 def test_a_frame_that_shows_nothing_of_the_object_is_left_out_by_name(run, object_only):
     result = run[0]
     records = tuple(replace(result.frames[0], name=name) for name in "ab")
-    found = with_object_only(replace(result, frames=records), object_only)
-    assert [frame.in_scan for frame in found.frames] == [True, False]
-    assert found.frames[1].stage == "separating" and "shows nothing of the object" in found.frames[1].reason
+    found = without_empty(records, object_only)
+    assert [frame.in_scan for frame in found] == [True, False]
+    assert found[1].stage == "separating" and "shows nothing of the object" in found[1].reason
     assert object_only.empty_frames() == ("b",)
 
 

@@ -89,7 +89,7 @@ def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, whole):
     result, log, root = whole
     assert log[0] == "4 frames of 130 x 130 pixels, decoder ramps"
     assert log[1].startswith("decoded and calibrated 4 of 4 frames")
-    assert "registered 4 of 4 frames" in log and log[-1].startswith("joint adjustment: frames agree to 0.0")
+    assert "registered 4 of 4 frames" in log and log[-1].startswith("frames agree to 0.0")
     assert check_scan(root / "s") == []
     assert (root / "s" / "processing.html").read_text() == "4 of 4"
     assert json.loads((root / "s" / "processing.json").read_text()) == json.loads(json.dumps(result.document()))

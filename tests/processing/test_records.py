@@ -104,7 +104,8 @@ def decoded():
     coords = rng.random((5, 7, 2)).astype(np.float32)
     coords[2] = np.nan
     light = np.where(np.isnan(coords[..., 0]), np.nan, rng.random((5, 7))).astype(np.float32)
-    return Decoded(coords, rng.random((5, 7)) > 0.3, rng.random((5, 7)).astype(np.float32), light)
+    notes = ("decoded to 4 px", "overexposed")
+    return Decoded(coords, rng.random((5, 7)) > 0.3, rng.random((5, 7)).astype(np.float32), light, notes)
 
 
 @pytest.mark.parametrize("lit", [True, False])
@@ -120,6 +121,7 @@ def test_a_frame_is_loaded_as_it_was_saved(tmp_path, frame, decoded, lit):
         np.testing.assert_array_equal(one.mask, decoded.mask)
         np.testing.assert_array_equal(one.pattern, saved.pattern)
         np.testing.assert_array_equal(one.light, saved.light)
+        assert one.notes == decoded.notes
     np.testing.assert_allclose(saved.pattern, decoded.pattern, atol=1e-5)
     assert saved.light is None if not lit else np.allclose(saved.light, decoded.light, rtol=1e-3, equal_nan=True)
 
@@ -135,9 +137,10 @@ def test_other_images_or_another_decoder_make_another_key(tmp_path, frame):
 def test_every_pattern_and_every_version_of_a_decoder_has_its_own_key(monkeypatch):
     gray, grid = DECODERS["graycode"], DECODERS["network"]
     keys = [gray(GrayCode(32, 24, 2)).key, gray(GrayCode(32, 24, 4)).key]
+    keys += [gray(GrayCode(32, 24, 2), order_stated=True).key, gray(GrayCode(32, 24, 2, centred=True)).key]
     keys += [grid(GridPattern(w=160, h=120)).key, grid(GridPattern(w=160, h=120, seed=1)).key]
     monkeypatch.setattr(gray, "version", gray.version + 1)
-    assert len({*keys, gray(GrayCode(32, 24, 2)).key}) == 5
+    assert len({*keys, gray(GrayCode(32, 24, 2)).key}) == 7
 
 
 def test_damaged_files_count_as_not_decoded(tmp_path, frame, decoded):

@@ -344,7 +344,7 @@ def test_where_only_a_flat_disk_is_seen_a_frame_is_right_or_named():
 
 def small(anchors: int, iterations: int) -> RegisteredFramesSettings:
     """Settings without the question whether there are other minima."""
-    adjustment = AdjustmentSettings(anchors_per_frame=anchors, max_iterations=iterations, other_minima=0)
+    adjustment = AdjustmentSettings(anchors_per_frame=anchors, max_iterations=iterations, other_minima=False)
     return RegisteredFramesSettings(adjustment=adjustment)
 
 

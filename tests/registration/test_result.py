@@ -40,6 +40,12 @@ def shrunk(factor: float):
     [
         ("baseline of frame 0 = 85 mm", KnownLength(0.085, "mm", ("0",))),
         ("baseline  of frame frame_00003=8.5e0cm", KnownLength(0.085, "cm", ("frame_00003",))),
+        ("baseline of frame pose 1 = 2 in", KnownLength(0.0508, "mm", ("pose 1",))),  # scans have metric units
+        ("baseline of frame 0 = 0.5 Inch", KnownLength(0.0127, "mm", ("0",))),
+        (
+            "distance from frame pose 1 (1, 2) to frame b(3, 4) = .5 m",
+            KnownLength(0.5, "m", ("pose 1", "b"), ((1.0, 2.0), (3.0, 4.0))),
+        ),
         (
             "distance between frame 3 (410.5, 200) and frame 7 (35,80.25) = 50 mm",
             KnownLength(0.05, "mm", ("3", "7"), ((410.5, 200.0), (35.0, 80.25))),
@@ -56,13 +62,18 @@ def test_lengths_are_understood(text, known):
     ("text", "message"),
     [
         ("85 mm", 'not understood(.|\n)*remedy: write "baseline of frame 0 = 85 mm"'),
-        ("baseline of frame 0 = 85 inch", 'unit "inch" is none of m, cm, mm, um'),
+        ("baseline of frame 0 = 85", "85 has no unit(.|\n)*as 85 mm; units are m, cm, mm, um, in, inch"),
+        ("baseline of frame 0 = 1e3", "1e3 has no unit"),
+        ("distance between frame 3 (1, 2) and frame 7 (3, 4) = 50", "50 has no unit"),
+        ("baseline of frame 0 = 85 feet", 'unit "feet" is none of m, cm, mm, um, in, inch'),
+        ("baseline of frame 0 = 8,5 mm", '"8,5 mm" is no length(.|\n)*a comma in place of the decimal point'),
+        ("baseline of frame 0 = mm", '"mm" is no length'),
         ("baseline of frame 0 = -85 mm", "a length must be above zero"),
         ("baseline of frame 0 = 0 mm", "a length must be above zero"),
         ("baseline of frame 0 = 1e-400 mm", "a length must be above zero"),
-        ("baseline of frame 0 = 1e-320 mm", r"a length must be between 1e-06 and 1e\+12 mm"),
-        ("baseline of frame 0 = 1e400 mm", r"a length must be between 1e-06 and 1e\+12 mm"),
-        ("baseline of frame 0 = nan mm", "not understood"),
+        ("baseline of frame 0 = 1e-320 mm", r"a length must be from 1e-06 to 1e\+12 mm"),
+        ("baseline of frame 0 = 1e400 mm", r"a length must be from 1e-06 to 1e\+12 mm"),
+        ("baseline of frame 0 = nan mm", '"nan mm" is no length'),
         ("distance between frame 3 and frame 7 = 50 mm", "not understood"),
     ],
 )

@@ -5,7 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.review.verdict import FrameFacts, PairFacts, Reason, ScanFacts, judge_scan, listed, worst
+from sl_nerfstudio.bundle_adjustment.modes import Mode
+from sl_nerfstudio.processing.result import HELP
+from sl_nerfstudio.review.verdict import (
+    FrameFacts,
+    PairFacts,
+    Reason,
+    ScanFacts,
+    judge_scan,
+    listed,
+    other_places,
+    worst,
+)
 from tests.review.cases import ring
 
 N = 12
@@ -137,3 +148,42 @@ def test_the_worst_reason_comes_first():
     verdict = worst([Reason("good", "a"), Reason("acceptable", "b"), Reason("poor", "c"), Reason("acceptable", "d")])
     assert (verdict.band, verdict.reasons) == ("poor", ("c", "b", "d"))
     assert listed(list("abcdefgh")) == "a, b, c, d, e, f and 2 more"
+
+
+def test_rays_that_miss_by_more_than_is_stated_make_the_starting_poses_poor() -> None:
+    frames = tuple(FrameFacts(f"f{k}", rays_px=38.0 + k, stated_px=10.0) for k in range(8))
+    verdict = judge_scan(ScanFacts(frames))
+    assert verdict.band == "poor"
+    for part in ("42 px (median)", "explains 10 px", "sl_pose_sigma", "sl-process"):
+        assert part in verdict.reasons[0]
+    assert judge_scan(ScanFacts(tuple(replace(f, stated_px=20.0) for f in frames))).band == "good"
+    one = replace(frames[0], rays_px=80.0), *(replace(f, rays_px=7.0) for f in frames[1:])
+    verdict = judge_scan(ScanFacts(one))
+    assert verdict.band == "acceptable" and verdict.reasons[0].startswith("f0: the rays of camera and projector miss")
+
+
+@pytest.mark.parametrize(("registered", "band"), [(True, "acceptable"), (False, "poor")])
+def test_a_turntable_before_a_static_background_is_never_good(registered: bool, band: str) -> None:
+    frames = tuple(FrameFacts(f"f{k}") for k in range(8))
+    verdict = judge_scan(ScanFacts(frames, moving_share=0.08, moving_registered=registered))
+    assert verdict.band == band and "turntable with a static background" in verdict.reasons[0]
+    assert "8%" in verdict.reasons[0] and "sl-process --masks" in verdict.reasons[0]
+
+
+def test_each_reason_ends_with_what_helps_in_the_words_of_a_command():
+    lost = {3: {"in_scan": False}, 4: {"sigma_rotation_deg": 5.0}}
+    verdict = judge_scan(scan(lost, wrong_intrinsics=True, adjusted=False)).with_help(HELP)
+    assert len(verdict.reasons) == 4 and all(any(end in reason for end in HELP.values()) for reason in verdict.reasons)
+    assert all("sl-process" in words or "sl-calibrate" in words for words in HELP.values())
+    assert worst([Reason("poor", "a", "again"), Reason("poor", "b")]).with_help({"again": "c"}).reasons == ("a; c", "b")
+
+
+@pytest.mark.parametrize(("log_odds", "band"), [(-8.0, "good"), (-5.7, "acceptable"), (-1.0, "poor"), (0.5, "poor")])
+def test_another_place_that_remains_possible_is_said_with_its_odds(log_odds: float, band: str) -> None:
+    mode = Mode(log_odds, 1.0, (1, 3), 90.0, (0.0, 0.0, 1.0))
+    frames = tuple(FrameFacts(f"f{k}") for k in range(8))
+    verdict = judge_scan(ScanFacts(frames, other_places=other_places([mode], [f.name for f in frames])))
+    assert verdict.band == band
+    if band != "good":
+        likely = "as likely" if log_odds > 0 else f"1 in {np.exp(-log_odds) + 1:.0f}"
+        assert verdict.reasons[0] == f"f1, f3: may be turned by 90 degrees against the others ({likely})"

@@ -34,7 +34,10 @@ def test_the_facts_are_those_of_the_files(scan: Scan, tmp_path):
     path = tmp_path / "refined/transforms.json"
     np.testing.assert_allclose(read_poses(path, scan).stacked(), scan.poses.stacked(), atol=1e-12)
     assert read_pose_sigmas(path, scan) == [PoseSigma(*row) for row in sigma.tolist()]
-    assert json.loads((tmp_path / "refined/training.json").read_text()) == json.loads(json.dumps(training_record(run)))
+    record = json.loads((tmp_path / "refined/training.json").read_text())
+    assert record == json.loads(json.dumps(training_record(run, settings)))
+    assert " ".join(record["commands"]["export"]).endswith(f"{tmp_path / 'refined'} --resolution 128 --overwrite")
+    assert record["commands"]["train"][:3] == ["ns-train", "sl-neus", "--data"]
     assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == [
         "mesh.ply",
         "pose_covariance.npz",

@@ -8,14 +8,8 @@ from scipy.spatial.transform import Rotation
 from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, look_at, only_fault, poses
 
 from sl_nerfstudio.scan import check_scan
-from sl_nerfstudio.scan.check_conventions import (
-    Correspondences,
-    apply_interpretation,
-    convention_problems,
-    fit_geometry,
-    other_interpretations,
-    sample_pixels,
-)
+from sl_nerfstudio.scan.check_conventions import apply_interpretation, convention_problems, other_interpretations
+from sl_nerfstudio.scan.check_geometry import Correspondences, fit_geometry, sample_pixels
 
 pytestmark = pytest.mark.slow
 

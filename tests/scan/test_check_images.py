@@ -23,7 +23,7 @@ from sphere_scan import (
 
 from sl_nerfstudio.errors import ScanError
 from sl_nerfstudio.scan import Scale, ScanWriter, check_scan, read_scan, write_transforms
-from sl_nerfstudio.scan.check_conventions import OtherClouds
+from sl_nerfstudio.scan.check_geometry import OtherClouds
 from sl_nerfstudio.scan.check_images import match_image
 from sl_nerfstudio.scan.images import encode_png
 

@@ -331,3 +331,48 @@ def test_pictures_are_no_mosaics():
     squares = np.where(np.add.outer(np.arange(96), np.arange(128)) % 4 < 2, grey, grey // 3).astype(np.uint8)
     for picture in (grey, noisy, stripes, squares, SCENE, np.zeros_like(grey), np.full_like(grey, 255), grey[:8]):
         assert not is_mosaic(picture)
+
+
+def _deep_with_alpha(path, alpha):
+    deep = np.dstack([SCENE.astype(np.uint16)[..., ::-1] * np.uint16(257), np.full(SCENE.shape[:2], alpha, np.uint16)])
+    cv2.imwrite(str(path), deep)
+
+
+@pytest.mark.parametrize("ending", [".png", ".tif"])
+def test_photographs_may_have_an_opaque_alpha_a_palette_of_greys_or_one_bit(tmp_path, ending):
+    path, grey = tmp_path / f"a{ending}", SCENE[..., 0]
+    palette = Image.fromarray(grey).convert("P", palette=Image.Palette.ADAPTIVE, colors=256)
+    for image, expected in (
+        (Image.fromarray(SCENE).convert("RGBA"), SCENE),
+        (Image.fromarray(grey).convert("LA"), grey),
+        (palette, np.array(palette.convert("L"))),
+        (Image.new("1", (128, 96)), np.zeros_like(grey)),
+        (Image.new("1", (128, 96), 1), np.full_like(grey, 255)),
+    ):
+        image.save(path)
+        pixels = read_photograph(path)
+        np.testing.assert_array_equal(pixels, expected)
+        header = photograph_header(path)
+        assert (header.h, header.w) == pixels.shape[:2] and header.mode == ("grey" if pixels.ndim == 2 else "RGB")
+    _deep_with_alpha(path, 65535)
+    np.testing.assert_array_equal(read_photograph(path), SCENE.astype(np.uint16) * np.uint16(257))
+    assert photograph_header(path).bits == 16
+
+
+def test_photographs_that_are_cut_out_or_have_few_colours_are_refused_with_the_command_that_converts(tmp_path):
+    path = tmp_path / "a.png"
+    cut = np.dstack([SCENE, np.full(SCENE.shape[:2], 255, np.uint8)])
+    cut[3, 4, 3] = 254
+    deep = tmp_path / "b.png"
+    _deep_with_alpha(deep, 65534)
+    for name, image, problem in (
+        (path, Image.fromarray(cut), "is transparent in places"),
+        (path, Image.fromarray(SCENE).convert("P"), "has a palette of colours"),
+        (deep, None, "is transparent in places"),
+    ):
+        if image is not None:
+            image.save(name)
+        for read in (read_photograph, photograph_header):
+            with pytest.raises(FileError, match=problem) as caught:
+                read(name)
+            assert f"{tmp_path}/*.png" in caught.value.remedy and "convert('RGB')" in caught.value.remedy

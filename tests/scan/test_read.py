@@ -316,3 +316,24 @@ def test_honest_coordinates_have_no_problem(seed, missing):
     coords = ((smooth - smooth.min((0, 1))) / np.ptp(smooth, (0, 1)) * (PROJECTOR.w, PROJECTOR.h)).astype(np.float32)
     coords[rng.random((30, 40)) < missing] = np.nan
     assert list(coordinate_problems(coords, PROJECTOR)) == []
+
+
+@pytest.mark.parametrize(
+    ("files", "problem", "remedy"),
+    [
+        (["a.jpg", "b.jpg"], "these are photographs, not a scan", "sl-process --images {} "),
+        (["images/a.jpg"], "these are photographs, not a scan", "sl-process --images {}/images "),
+        (["p0/a.png", "p1/a.png"], "these are photographs, not a scan", "sl-process --images {} "),
+        (["images/p0/a.png"], "these are photographs, not a scan", "sl-process --images {}/images "),
+        (["scan/transforms.json"], "there is one in scan", "give {}/scan"),
+        (["transforms_train.json", "train/a.png"], "there is transforms_train.json", "sl-process"),
+        (["images/a.png", "coords/a.npz"], "is missing in", "sl-process makes one from photographs"),
+        ([], "is missing in", "sl-process makes one from photographs"),
+    ],
+)
+def test_a_folder_without_a_scan_is_named_by_what_it_holds(tmp_path, files, problem, remedy):
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"x")
+    (fault,) = check_scan(tmp_path)
+    assert problem in fault.problem and remedy.format(tmp_path) in fault.remedy

@@ -125,7 +125,7 @@ def test_a_written_mesh_comes_back_exactly(tmp_path, scenes):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("cube", None, "neither a built-in scene .cone-and-cylinder, head, .*bump, relief, rod. nor"),
+        ("cube", None, "neither a built-in scene .cone-and-cylinder, head, .*rod, flange, .*labelled-bottle. nor"),
         ("absent.ply", None, "there is no such file"),
         ("text.ply", b"hello", "cannot be read as a mesh"),
         ("points.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from sl_nerfstudio.calibration.stated import describe_change
+from sl_nerfstudio.console import unit_word
 from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement, FramePixels, frame_pixels
 from sl_nerfstudio.evaluation.evaluate import Evaluation, EvaluationInputs, Length
 from sl_nerfstudio.evaluation.judgement import Judgement
@@ -372,8 +373,8 @@ def _summary(report: ReportInput) -> list[tuple[str, str]]:
         ("Unit", scan.units),
         ("Scale", scale if scan.scale.source or not scan.scale.known else "known"),
         ("Pixels with pattern", f"{sum(f.pixels for f in frames):,}, of which {decoded:.0%} were decoded"),
-        ("Distance of the cameras", f"{np.median(distance):.4g} {scan.units} (median)"),
-        ("Camera to projector", f"{np.median(baseline):.4g} {scan.units} (median), "
+        ("Distance of the cameras", f"{np.median(distance):.4g} {unit_word(scan.units)} (median)"),
+        ("Camera to projector", f"{np.median(baseline):.4g} {unit_word(scan.units)} (median), "
          f"{np.min(baseline):.4g} to {np.max(baseline):.4g}"),
-        ("Mesh", f"{len(mesh.faces):,} triangles, {size[0]:.4g} × {size[1]:.4g} × {size[2]:.4g} {scan.units}"),
+        ("Mesh", f"{len(mesh.faces):,} triangles, {' × '.join(f'{s:.4g}' for s in size)} {unit_word(scan.units)}"),
     ]  # fmt: skip

@@ -35,7 +35,7 @@ def settings(root: Path, output: Path, name: str = "first", steps: int = STEPS, 
     config.pipeline.datamanager.train_num_rays_per_batch = 64
     model = config.pipeline.model
     # One search for the poses is enough.
-    model.adjustment = replace(model.adjustment, other_minima=0, hops=0)
+    model.adjustment = replace(model.adjustment, further_searches=False, other_minima=False)
     sdf = model.sdf
     sdf.log2_table_size, sdf.max_resolution, sdf.hidden = 10, 64, 16
     for key, value in more.items():

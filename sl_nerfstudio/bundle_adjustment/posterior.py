@@ -1,0 +1,146 @@
+"""Which of two rigs is more probable: one posterior, of the look-ups that exist at both, and of the starting poses.
+
+What exists at one of them alone says nothing by itself: frames that are turned onto one side of a round object see
+each other more than they do where they belong, and agree as far as the object is round. So both are asked the same: an
+anchor is the same pixel of the same frame, at the depth that each rig gives it, and the same frames look it up.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.observations import anchors_at, in_front_of, observe, partners
+from sl_nerfstudio.bundle_adjustment.parameters import (
+    PosePrior,
+    PriorTerm,
+    baseline_scale,
+    by_frame,
+    gauge_directions,
+    restore,
+)
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Rig, residuals_of
+from sl_nerfstudio.bundle_adjustment.search import (
+    EVERY_FRAME_PER_ANCHOR,
+    INDEPENDENT,
+    LEAST_COSINE,
+    PARTNERS,
+    SearchProblem,
+)
+from sl_nerfstudio.geometry.numerics import geman_mcclure_cost
+
+_COMPARED_ANCHORS = 300  # decoded pixels of each frame that are looked up
+_COMPARED_NOISES = 4.0  # residual at which a look-up costs half of what a contradiction costs
+_NATS = _COMPARED_NOISES**2 / 2  # cost of a look-up that contradicts, however far off it is
+_HIDDEN = 2.0  # widths of the kernel from which on a nearer surface is another one, which hides the anchor
+_BLOCK = 32  # pixels along each side: look-ups of anchors within such a block may depend on each other
+_MOST_CELLS = 2**12  # along each side of an image
+_LEAST_ODDS = 5.0  # nats by which a rig must be more probable, at least, and by more than their standard error
+GROSS = 25.0  # nats that a frame costs whose starting pose is wrong altogether: once in a thousand frames, and then
+# anywhere (six of twelve dimensions, each some 20 sigma wide)
+_MOST_STEPS, _CONVERGED = 30, 1e-6  # of the similarity at which the starting poses are least contradicted
+
+
+@dataclass(frozen=True)
+class Odds:
+    """How many times as probable one rig is as another, as logarithms (nats): below zero if it is less probable."""
+
+    data: float  # of the look-ups
+    prior: float  # of the starting poses
+    error: float  # standard error of `data`
+
+    @property
+    def nats(self) -> float:
+        """Of the whole posterior."""
+        return self.data + self.prior
+
+    @property
+    def better(self) -> bool:
+        """Whether one rig is more probable by more than the uncertainty of the comparison."""
+        return self.nats > max(_LEAST_ODDS, self.error)
+
+
+def odds(problem: SearchProblem, one: Rig, two: Rig, noise: float) -> Odds:
+    """Compare two rigs; `noise` is that of one look-up, in projector pixels.
+
+    A contradiction costs a fixed amount, however far off it is. A camera that sees another surface in front of the
+    anchor says nothing. Look-ups of a frame are correlated: together they count as `INDEPENDENT`, however many they
+    are. The prior counts in full, so a rig far from the starting poses must explain far better what both explain.
+    """
+    generator = torch.Generator().manual_seed(problem.settings.seed)
+    frame, uv = problem.maps.draw(torch.arange(one.frames), _COMPARED_ANCHORS, generator)
+    (mine, good), (theirs, as_good) = (anchors_at(rig, problem.maps, frame, uv) for rig in (one, two))
+    both = good & as_good
+    ends = [(one, mine.chosen(both)), (two, theirs.chosen(both))]
+    rows = _common(problem.maps, ends, generator)
+    found = [residuals_of(rig, anchors, rows, problem.maps) for rig, anchors in ends]
+    width = _COMPARED_NOISES * noise
+    common = found[0].cross_valid & found[1].cross_valid
+    for (rig, anchors), r in zip(ends, found, strict=True):
+        far = r.cross.norm(dim=-1) > _HIDDEN * width
+        common &= ~(far & in_front_of(rig, anchors, rows, problem.maps))
+    costs = [geman_mcclure_cost((torch.cat([r.own, r.cross[common]]) / width).square().sum(-1)) for r in found]
+    share = min(INDEPENDENT * one.frames / max(int(common.sum()), 1), 1.0)
+    gain = _NATS * share * (costs[1] - costs[0])
+    cell = (uv[both] / _BLOCK).long()
+    block = (frame[both] * _MOST_CELLS + cell[:, 1]) * _MOST_CELLS + cell[:, 0]
+    mean, error = mean_and_error(gain, torch.cat([block, block[rows.anchor[common]]]))
+    prior = prior_cost(problem.prior, problem.start, two) - prior_cost(problem.prior, problem.start, one)
+    return Odds(mean * len(gain), prior, error * len(gain))
+
+
+def prior_cost(prior: PosePrior, start: Rig, rig: Rig) -> float:
+    """What the starting poses say against a rig, in nats, wherever it is as a whole and however large.
+
+    The starting pose of any frame may be wrong altogether, which costs a fixed amount. Half of them count on the way,
+    however far they are.
+    """
+    term = PriorTerm(prior, start, 0.5)
+    rig = restore(start, rig, baseline_scale(start, rig, None))
+    for _ in range(_MOST_STEPS):
+        energies = term.energies(rig)
+        right = torch.sigmoid(GROSS - energies / (energies.median() / GROSS).clamp_min(1))[:, None, None]
+        H, g = term.equations(rig)
+        G = by_frame(gauge_directions(rig))
+        information, pull = (G.mT @ (right * H) @ G).sum(0), (G.mT @ (right * g[..., None])).sum(0)[:, 0]
+        step = -torch.linalg.lstsq(information, pull[:, None], driver="gelsd").solution[:, 0]
+        rig = rig.scaled(float(step[6].clamp(-1, 1).exp()))
+        rig = rig.moved(step[:6].expand(rig.frames, 6), torch.zeros(rig.frames, 6, dtype=step.dtype))
+        if float(step.abs().max()) < _CONVERGED:
+            break
+    return -float(torch.logaddexp(-term.energies(rig), torch.tensor(-GROSS, dtype=step.dtype)).sum())
+
+
+def mean_and_error(values: Float[Tensor, "n"], block: Int[Tensor, "n"]) -> tuple[float, float]:
+    """Mean and its standard error, if the values within a block may depend on each other in any way.
+
+    The error of a ratio of sums over blocks (Cochran, Sampling Techniques, 1977, section 6.3).
+    """
+    mean = values.mean()
+    _, index = torch.unique(block, return_inverse=True)
+    blocks = int(index.max()) + 1 if len(index) else 0
+    if blocks < 2:
+        return float(mean), float("inf")
+    sums = torch.zeros(blocks, dtype=values.dtype).index_add(0, index, values - mean)
+    return float(mean), float((blocks / (blocks - 1) * (sums**2).sum()).sqrt() / len(values))
+
+
+def _common(maps: CoordinateMaps, ends: list[tuple[Rig, Anchors]], generator: torch.Generator) -> Observations:
+    """Anchors in frames that see them at both ends; a random choice of these if there are too many."""
+    allowed = torch.stack([partners(*end, maps, PARTNERS, LEAST_COSINE, generator) for end in ends]).any(0)
+    first, second = (_numbers(maps, *end, allowed, generator) for end in ends)
+    common = first[torch.isin(first, second)]
+    most = EVERY_FRAME_PER_ANCHOR * len(ends[0][1].frame)
+    chosen = common[torch.randperm(len(common), generator=generator)[:most].sort().values]
+    frames = ends[0][0].frames
+    return Observations(chosen // frames, chosen % frames)
+
+
+def _numbers(
+    maps: CoordinateMaps, rig: Rig, anchors: Anchors, allowed: Tensor, generator: torch.Generator
+) -> Int[Tensor, "rows"]:
+    """Every look-up of an end as one number: of its anchor, then of the frame that looks it up."""
+    rows = observe(rig, anchors, maps, rig.frames, float("inf"), LEAST_COSINE, generator, allowed)
+    return rows.anchor * rig.frames + rows.frame
