@@ -42,7 +42,7 @@ Decoding has the `version` of its decoder instead."""
 
 KEPT: tuple[type, ...] = (
     result.Registration, result.Edge, result.SurfaceDisagrees, result.NoCommonSurface, result.SeparateComponent,
-    result.PoorPair, result.PairsContradict, result.CoordinatesDisagree, result.UndecidedProjector,
+    result.PoorPair, result.OpenPlace, result.CoordinatesDisagree, result.UndecidedProjector,
     result.UncertainRotation, result.SeparatePoses,
     ConsistentFrames, AdjustedFrames, Mode, DevicePoses, PoseSigma, SelfCalibration,
     Device, ProjectorEstimate, NoProjector, StaticPlacement, NoPlacement, IntrinsicsEvidence,

@@ -18,14 +18,12 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
     find_registered_minimum,
     keep_registered,
 )
-from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.parallel import one_library_thread, results
 from sl_nerfstudio.processing.config import FEWEST_FRAMES
 from sl_nerfstudio.processing.records import LargeClouds
-from sl_nerfstudio.registration.register import include_left_out, with_edges_at_poses, with_relative_pose
+from sl_nerfstudio.registration.register import include_left_out, with_relative_pose
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
-    PairsContradict,
     Registration,
     SeparatePoses,
     UndecidedProjector,
@@ -42,12 +40,7 @@ from sl_nerfstudio.review.agreement import (
 )
 
 _EXCLUSIONS = 4  # times that contradicting frames are taken out of one group
-_MOVES = 3  # times that frames are tried at other places
 _INCLUSIONS = 3  # times that frames left out are placed
-_DOUBTFUL_EXCESS = 1.3  # residual of a frame, relative to the better pairs, from which other places are tried
-_DOUBTFUL_SHARE = 0.02  # points that agree fewer than usual, as a share, from which they are tried
-_MOST_DOUBTFUL = 6  # frames that are tried at once, at most a third: the others must say where they belong
-_ELSEWHERE_DEG = 8.0  # rotation between two places of a frame
 
 
 @dataclass(frozen=True)
@@ -67,19 +60,15 @@ def adjust_consistent(
 ) -> ConsistentFrames:
     """Adjust all registered frames, and again without those that contradict the largest group that agrees.
 
-    Frames that agree less well than most are tried at other places, and stay where they agree better. Frames that were
-    left out come in if they can be placed against the adjusted ones and agree with them. What surfaces do not tell
-    before, they do not tell afterwards either: frames that fit at several places stay out, and of what looks the same
-    from several sides no frame is moved. How far other minima are is asked of the last group only.
+    Frames that were left out come in if they can be placed against the adjusted ones and agree with them. Of what looks
+    the same from several sides none is: surfaces do not tell afterwards what they did not tell before. How far other
+    minima are is asked of the last group only.
 
     Raises UserError if fewer than two frames are registered.
     """
     run = _Adjuster(clouds, log, settings)
     undecidable = _undecidable(registration)
-    group = run.without_contradictions(run.adjusted(registration))
-    if len(undecidable) < len(clouds):
-        group = run.with_moved(group)
-    group = run.with_included(group, undecidable)
+    group = run.with_included(run.without_contradictions(run.adjusted(registration)), undecidable)
     return ConsistentFrames(group.registration, group.minimum.with_other_minima(), group.cross)
 
 
@@ -96,7 +85,7 @@ def _undecidable(registration: Registration) -> set[int]:
     """Frames that fit at several places: all if the object looks the same from several sides."""
     if registration.by_order or registration.turns_deg:
         return set(range(len(registration.names)))
-    torn = {e.frame for e in registration.exclusions if isinstance(e, PairsContradict | UndecidedProjector)}
+    torn = {e.frame for e in registration.exclusions if isinstance(e, UndecidedProjector)}
     return {k for k, name in enumerate(registration.names) if name in torn}
 
 
@@ -147,43 +136,6 @@ class _Adjuster:
             group = self.adjusted(without_groups(group.registration, lost))
         return group
 
-    def with_moved(self, group: _Group) -> _Group:
-        """The group with frames that agree less well than the rest at other places, as long as they agree better.
-
-        Of an object that nearly looks the same from several sides, surfaces that are bent by the errors of their own
-        relative poses may not tell at which a frame is; adjusted ones do.
-        """
-        for _ in range(_MOVES):
-            there, turned = self._elsewhere(group)
-            if there is None:
-                break
-            pairs = [(group.agreement(k), there.agreement(k)) for k in turned]
-            if not all(now.excess <= before.excess and now.share >= before.share for before, now in pairs):
-                break
-            group = self.without_contradictions(there)
-        return group
-
-    def _elsewhere(self, group: _Group) -> tuple[_Group | None, list[int]]:
-        """The group adjusted with its doubtful frames where the others place them, and those that this turns."""
-        registration, poses = group.registration, group.minimum.frames.poses
-        index = np.flatnonzero(registration.registered).tolist()
-        doubtful = [index[n] for n in _doubtful(group.cross)]
-        without = replace(
-            registration, registered=registration.registered & ~np.isin(range(len(self.clouds)), doubtful)
-        )
-        placed = self._placed(replace(group, registration=without), doubtful)
-        turned = [
-            k for k in doubtful if placed.registered[k]
-            and angle_deg(placed.T_world_camera[k, :3, :3] @ poses.T_world_camera[k, :3, :3].T) > _ELSEWHERE_DEG
-        ]  # fmt: skip
-        if not turned:
-            return None, []
-        self.log(f"tried at other places, where they may agree better: {group.named(turned)}")
-        T, baseline = poses.T_world_camera.copy(), poses.baseline.copy()
-        T[turned], baseline[turned] = placed.T_world_camera[turned], placed.baseline[turned]
-        moved = replace(registration, T_world_camera=T, baseline=baseline)
-        return self.adjusted(with_edges_at_poses(moved, [registration.names[k] for k in turned])), turned
-
     def with_included(self, group: _Group, undecidable: set[int]) -> _Group:
         """The group with frames that were left out and can be placed against it.
 
@@ -219,17 +171,6 @@ class _Adjuster:
         kept = LargeClouds()
         sharper = results([partial(_sharper, cloud, group, k, kept) for k, cloud in enumerate(self.clouds)])
         return include_left_out(sharper, group.registration, group.minimum.frames.poses, candidates)
-
-
-def _doubtful(cross: CrossFrameAgreement) -> list[int]:
-    """Places in `cross` of frames that agree less well than most; of many, the worst."""
-    judged = {n: frame for n, frame in enumerate(cross.frames) if np.isfinite(frame.share)}
-    if not judged:
-        return []
-    usual = float(np.median([frame.share for frame in judged.values()]))
-    doubts = {n: max(usual - f.share - _DOUBTFUL_SHARE, f.excess - _DOUBTFUL_EXCESS) for n, f in judged.items()}
-    worst = sorted((n for n, doubt in doubts.items() if doubt > 0), key=lambda n: -doubts[n])
-    return sorted(worst[: min(_MOST_DOUBTFUL, len(cross.frames) // 3)])
 
 
 def _sharper(cloud: FrameCloud, group: _Group, k: int, kept: LargeClouds) -> FrameCloud:

@@ -25,7 +25,7 @@ from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     Exclusion,
     NoCommonSurface,
-    PairsContradict,
+    OpenPlace,
     Registration,
     SeparateComponent,
     SurfaceDisagrees,
@@ -86,10 +86,14 @@ def exclusion_sentence(exclusion: Exclusion) -> str:
         )
     if isinstance(exclusion, NoCommonSurface):
         return "no other frame shows any of its surface; capture views in between"
-    if isinstance(exclusion, PairsContradict):
+    if isinstance(exclusion, OpenPlace):
+        others = [name for name in exclusion.group if name != exclusion.frame]
+        group = f"it and {listed(others, _LISTED)} fit" if others else "it fits"
+        where = f"between it and {exclusion.partner}" if exclusion.partner else "between it and the other frames"
+        odds = f"odds of {np.exp(exclusion.log_odds):.0f} to 1" if exclusion.log_odds > 1 else "even odds"
         return (
-            f"{exclusion.contradicting} of its {exclusion.pairs} pairs with other frames contradict the pose that the "
-            "rest of them say; capture this view again, and views beside it"
+            f"{group} the other frames in two ways, {exclusion.turn_deg:.0f} degrees apart ({odds}); capture views "
+            f"{where}, or put a mark on the object (chalk, tape, a screw) that both see"
         )
     if isinstance(exclusion, UndecidedProjector):
         return (

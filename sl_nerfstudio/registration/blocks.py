@@ -1,92 +1,193 @@
 """Blocks of frames against the rest: each may belong to another side of what nearly looks the same from several sides.
 
-Frames are joined one after the other, so a wrong pair may have put a whole block of them where it fits less well. Every
-turn of the world that some pair says is tried on the block for which it gains most, by the log-odds of all pairs of
-frames across it: which frames belong to it is a cut of a graph (as in Kernighan and Lin, 1970). What the best cut does
-not decide stays apart.
+Frames are joined one after the other, so a join that was nearly open may have put a whole block of them where it fits
+less well. Every turn of the world that some pair says is tried on the block for which it gains most, by the log-odds of
+all pairs of frames across its border: which frames belong to it is a cut of a graph (Kernighan and Lin, 1970). Blocks
+move to where they are likelier. A block that is nearly as likely elsewhere is not decided, and stays apart.
 """
 
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import (
-    Component,
-    Pivots,
-    PoseGraphSolution,
-    Prior,
-    facing,
-    optimise_pose_graph,
-)
-from sl_nerfstudio.registration.evidence import ScanEvidence
-from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_PLACE_DEG, PairMatch, edge_weights
+from sl_nerfstudio.registration.assembly import SAME_TURN_DEG, Assembly, Prior, log_odds_at, looks_alike
+from sl_nerfstudio.registration.pairs import LEAST_ODDS, PairMatch, edge_weights
+from sl_nerfstudio.registration.pose_graph import Component, Pivots, at_places, optimise_pose_graph
 
-FACING = 8  # frames with which each is compared, before a turn and after it
-MOST_TURNS = 16  # of the world that are tried
+MOST_TURNS = 24  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
-LEAST_GAIN = 1.0  # nats by which a block must fit better elsewhere
+LEAST_GAIN = 1.0  # nats by which a block must fit better elsewhere to be moved
+MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
 STARTS = 24  # frames from which a block is grown
-SAME_TURN_DEG = 4.0  # between two turns of the world below which they are one
 
 
-def at_places(edges: Sequence[PairMatch], nodes: Component) -> list[PairMatch]:
-    """The pairs, each at that of its places which is nearest to where its frames are."""
-    out: list[PairMatch] = []
-    for e in edges:
-        if e.source not in nodes or e.target not in nodes:
-            out.append(e)
-            continue
-        here = nodes[e.target].inverse() @ nodes[e.source]
-        places = [e.S_target_source, *(rival.S_target_source for rival in e.rivals)]
-        nearest = min(places, key=lambda S: angle_deg(S.R @ here.R.T))
-        out.append(e if nearest is e.S_target_source else replace(e, S_target_source=nearest))
-    return out
+@dataclass(frozen=True)
+class OpenBlock:
+    """Frames that are nearly as likely elsewhere, where they are likeliest."""
+
+    nodes: Component
+    turn_deg: float  # between the two places
+    log_odds: float  # of this one, nats
+
+
+@dataclass(frozen=True)
+class Settled:
+    """A component with every block where it is likeliest."""
+
+    decided: Component
+    open: tuple[OpenBlock, ...]  # in the same world
+    by_order: bool  # surfaces alone would have left more open
+
+
+@dataclass(frozen=True)
+class Turn:
+    """A turn of the world, and what each pair of frames (first moved, second stays) gains by it, nats."""
+
+    S_world_world: Similarity
+    alike: bool  # the surface looks the same after it
+    by_surface: Float64[ndarray, "n n"]
+    by_order: Float64[ndarray, "n n"]
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A block of frames, and what its turn gains, nats."""
+
+    gain: float
+    block: Bool[ndarray, "n"]
+    turn: Turn
+
+
+class BlockReview:
+    """Looks for blocks that fit as well elsewhere: by pairs that were registered, then by all frames that face them."""
+
+    def __init__(
+        self, assembly: Assembly, pivots: Pivots, edges: Sequence[PairMatch], component: Component, prior: Prior | None
+    ) -> None:
+        self._assembly, self._pivots, self._prior = assembly, pivots, prior
+        self._edges = [e for e in edges if e.source in component and e.target in component]
+        self._degree = Counter(k for e in self._edges for k in (e.source, e.target))
+        self.nodes = optimised(self._edges, pivots, component)
+
+    def settled(self) -> Settled:
+        """Move blocks to where they are likeliest; take out those whose place is not decided."""
+        for _ in range(MOST_MOVES):
+            turns = self._turns()
+            cuts = sorted((best_block(t.by_surface + t.by_order, t) for t in turns), key=lambda cut: -cut.gain)
+            likely = (cut for cut in cuts if cut.gain > LEAST_GAIN and self._verified(cut) > LEAST_GAIN)
+            if (cut := next(likely, None)) is None:
+                break
+            moved = self._frames(cut.block)
+            nodes = {k: cut.turn.S_world_world @ S if k in moved else S for k, S in self.nodes.items()}
+            self.nodes = optimised(self._edges, self._pivots, nodes)
+        turns = self._turns()
+        open_ = self._open(turns, with_order=True)
+        without = open_ if self._prior is None else self._open(turns, with_order=False)
+        out = {k for block in open_ for k in block.nodes}
+        return Settled(
+            {k: S for k, S in self.nodes.items() if k not in out},
+            tuple(open_),
+            sum(len(block.nodes) for block in without) > len(out),
+        )
+
+    def _open(self, turns: Sequence[Turn], with_order: bool) -> list[OpenBlock]:
+        """Blocks whose place is not decided, one after the other: of two parts the smaller is taken out."""
+        n, left = len(self.nodes), np.arange(len(self.nodes))
+        found: list[OpenBlock] = []
+        while len(left) > 1:
+            cuts: list[Cut] = []
+            for turn in turns:
+                gain = turn.by_surface + turn.by_order if with_order else turn.by_surface
+                part = best_block(gain[np.ix_(left, left)], turn)
+                block = np.zeros(n, dtype=bool)
+                block[left[part.block]] = True
+                cuts.append(Cut(part.gain, block, turn))
+            inside = np.isin(np.arange(n), left)
+            likely = [cut for cut in sorted(cuts, key=lambda cut: -cut.gain) if cut.gain > -LEAST_ODDS]
+            verified = ((cut, self._verified(cut, inside, with_order)) for cut in likely)
+            cut, gain = next((one for one in verified if one[1] > -LEAST_ODDS), (None, 0.0))
+            if cut is None:
+                break
+            block = cut.block if 2 * cut.block.sum() <= len(left) else inside & ~cut.block
+            nodes = {k: self.nodes[k] for k in sorted(self._frames(block))}
+            found.append(OpenBlock(nodes, angle_deg(cut.turn.S_world_world.R), -gain))
+            left = np.flatnonzero(inside & ~block)
+        return found
+
+    def _frames(self, block: Bool[ndarray, "n"]) -> set[int]:
+        return set(np.array(list(self.nodes))[block].tolist())
+
+    def _verified(self, cut: Cut, inside: Bool[ndarray, "n"] | None = None, with_order: bool = True) -> float:
+        """What a turn gains by all frames that face each other across the border, before it or after it."""
+        moved = self._frames(cut.block)
+        kept = self._frames(~cut.block if inside is None else inside & ~cut.block)
+        first, second = ({k: self.nodes[k] for k in sorted(part)} for part in (kept, moved))
+        places = [Similarity.identity(), cut.turn.S_world_world]
+        gain = float(self._assembly.compare(first, second, places, cut.turn.alike).leads[1, 0])
+        if with_order:
+            gain += self._assembly.usual(first, second, places[1]) - self._assembly.usual(first, second, places[0])
+        return gain
+
+    def _turns(self) -> list[Turn]:
+        """All turns with what they gain."""
+        return [self._turn(S) for S in turns_said(self._edges, self.nodes)]
+
+    def _turn(self, turn: Similarity) -> Turn:
+        frames = list(self.nodes)
+        column = {k: n for n, k in enumerate(frames)}
+        surface, order = np.zeros((2, len(frames), len(frames)))
+        inverse = turn.inverse()
+        alike = looks_alike(self._edges, self.nodes, turn)
+        for e in self._edges:
+            i, j, S = column[e.source], column[e.target], self.nodes[e.target].inverse()
+            here = log_odds_at(e, S @ self.nodes[e.source])
+            weight = 2 / (self._degree[e.source] + self._degree[e.target])  # see Assembly.compare
+            for moved, kept, way in ((i, j, S @ turn), (j, i, S @ inverse)):
+                there = log_odds_at(e, way @ self.nodes[e.source])
+                if not (alike and (here is None or there is None)):  # see Comparison
+                    before, after = (-MOST_AGAINST if odds is None else odds for odds in (here, there))
+                    surface[moved, kept] += weight * (after - before)
+        if self._prior is not None:
+            for i, S_i in self.nodes.items():
+                for j, S_j in self.nodes.items():
+                    if i != j:
+                        back = S_j.inverse()
+                        usual = self._prior(i, j, back @ S_i)
+                        order[column[i], column[j]] = self._prior(i, j, back @ turn @ S_i) - usual if usual else 0.0
+        return Turn(turn, alike, surface, order)
+
+
+def optimised(edges: Sequence[PairMatch], pivots: Pivots, nodes: Component) -> Component:
+    """All pairs optimised together, each at its place nearest to where its frames are."""
+    placed = at_places(edges, nodes)
+    return optimise_pose_graph(placed, pivots, nodes, edge_weights(placed)).S_world_camera
 
 
 def turns_said(edges: Sequence[PairMatch], nodes: Component) -> list[Similarity]:
-    """Clearly different turns of the world after which pairs fit as well or better; the most likely first."""
+    """Clearly different turns of the world after which some pair fits as well or nearly; the most likely first."""
     said: list[tuple[float, Similarity]] = []
     for e in edges:
-        if e.source not in nodes or e.target not in nodes:
-            continue
         target, source = nodes[e.target], nodes[e.source].inverse()
-        places = [(0.0, e.S_target_source), *((r.log_odds, r.S_target_source) for r in e.rivals)]
-        said += [(odds, target @ S @ source) for odds, S in places]
+        here = log_odds_at(e, target.inverse() @ nodes[e.source])
+        here = -MOST_AGAINST if here is None else here
+        for S, odds in [(e.S_target_source, 0.0), *((r.S_target_source, r.log_odds) for r in e.rivals)]:
+            turn = target @ S @ source
+            said += [(odds - here, turn), (odds - here, turn.inverse())]
     found: list[Similarity] = []
     for _, turn in sorted(said, key=lambda one: -one[0]):
-        known = (Similarity.identity(), *found)
-        if len(found) < MOST_TURNS and all(angle_deg(turn.R @ T.R.T) > SAME_TURN_DEG for T in known):
+        if len(found) == MOST_TURNS:
+            break
+        if all(angle_deg(turn.R @ T.R.T) > SAME_TURN_DEG for T in (Similarity.identity(), *found)):
             found.append(turn)
     return found
 
 
-def gains(
-    scan: ScanEvidence, nodes: Component, turn: Similarity, prior: Prior | None
-) -> Float64[ndarray, "n n"]:
-    """Nats that are gained across each pair of frames if the first is moved by a turn and the second stays."""
-    frames = list(nodes)
-    out = np.zeros((len(frames), len(frames)))
-    for row, i in enumerate(frames):
-        own, others = {i: nodes[i]}, {j: S for j, S in nodes.items() if j != i}
-        before = {j for _, j in facing(own, others, Similarity.identity(), FACING)}
-        after = {j for _, j in facing({i: turn @ nodes[i]}, others, Similarity.identity(), FACING)}
-        for j in before | after:
-            now, moved = nodes[j].inverse() @ nodes[i], nodes[j].inverse() @ turn @ nodes[i]
-            leads, _ = scan.comparison(i, j, [now if j in before else None, moved if j in after else None])
-            out[row, frames.index(j)] = leads[1, 0]
-        if prior is not None:
-            for column, j in enumerate(frames):
-                if j != i:
-                    S = nodes[j].inverse()
-                    out[row, column] += prior(i, j, S @ turn @ nodes[i]) - prior(i, j, S @ nodes[i])
-    return out
-
-
-def best_block(gain: Float64[ndarray, "n n"]) -> tuple[float, Bool[ndarray, "n"]]:
+def best_block(gain: Float64[ndarray, "n n"], turn: Turn) -> Cut:
     """The block of frames, neither none nor all, whose turn gains most across its border.
 
     Blocks grow from each of the frames that would gain most alone, by the frame that is best then.
@@ -103,28 +204,4 @@ def best_block(gain: Float64[ndarray, "n n"]) -> tuple[float, Bool[ndarray, "n"]
             if total > most:
                 most, best = total, block.copy()
             nearest = int(np.where(block, -np.inf, more).argmax())
-    return most, best
-
-
-def settled(
-    scan: ScanEvidence, pivots: Pivots, edges: Sequence[PairMatch], start: PoseGraphSolution, prior: Prior | None
-) -> tuple[PoseGraphSolution, list[Component]]:
-    """A component with its blocks where they are most likely, and those of them whose place is not decided."""
-    solution = start
-    for _ in range(MOST_MOVES):
-        nodes = solution.S_world_camera
-        found = [(*best_block(gains(scan, nodes, turn, prior)), turn) for turn in turns_said(edges, nodes)]
-        gain, block, turn = max(found, key=lambda one: one[0], default=(0.0, np.zeros(0, bool), Similarity.identity()))
-        if gain < LEAST_GAIN:
-            break
-        frames = np.array(list(nodes))[block].tolist()
-        moved = {k: turn @ S if k in frames else S for k, S in nodes.items()}
-        solution = optimised(edges, pivots, moved)
-    open_ = [np.array(list(solution.S_world_camera))[block].tolist() for gain, block, _ in found if gain > -LEAST_ODDS]
-    return solution, [{k: solution.S_world_camera[k] for k in frames} for frames in open_]
-
-
-def optimised(edges: Sequence[PairMatch], pivots: Pivots, nodes: Component) -> PoseGraphSolution:
-    """All pairs optimised together, each at its place nearest to where its frames are."""
-    placed = at_places(edges, nodes)
-    return optimise_pose_graph(placed, pivots, nodes, edge_weights(placed))
+    return Cut(most, best, turn)

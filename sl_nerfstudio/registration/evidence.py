@@ -1,4 +1,4 @@
-"""Evidence for the place of two frames against each other: the likelihood of what one decoded, given the other's surface.
+"""Evidence for the place of two frames: the likelihood of what one of them decoded, given the surface of the other.
 
 Each frame is a lattice of distances along the rays of its camera, at the resolution at which it was decoded. A point of
 one frame that falls on a place of the other has a residual: how far it lies behind the surface there, along the other's
@@ -11,7 +11,7 @@ of a correlation area count as one.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -53,7 +53,8 @@ LARGEST_SPREAD = 8.0  # sigma over that of smooth surface, up to which these sha
 LARGEST_RESIDUAL = 100.0
 NOISE_QUANTILES = np.array([0.68, 0.95])  # of residuals, by which a pair's are compared with that density
 NOISE_RESIDUALS = np.array([1.06, 3.2])  # its quantiles there
-USUAL_LOG_DENSITY = -1.3  # of a residual in the right place
+USUAL_SIGMAS = 1.0  # of a residual in the right place
+INDISTINCT_SIGMAS = 2.5  # within which residuals say nothing of the place: views that are alike share errors
 SPREADS = np.array([0.8, 1.2, 1.8, 3.0, 6.0])  # sigma relative to the usual one: points are grouped by it
 LARGEST_SHARED = 2.0  # factor by which residuals may be smaller, or larger, for that
 FEWEST_JUDGED = 50  # points by which that is known
@@ -67,11 +68,16 @@ ABSENT_SHARE, LEAST_ABSENT = (
 
 LEAST_SEEN = 0.3  # points that a place must let be judged, relative to the place that lets most
 LEAST_AGREEING = 0.7  # of those that it lets be judged, for a place to be such a measure
+LEAST_ODDS = 10.0  # nats that decide: errors of the decoder that pixels share make wrong places lead by a few
 LARGEST_LEAD = 1e6  # nats: of the only place
 
 NEAR_THINNED = 3  # only each so-manieth point is used to find the most likely place close to one
 NEAR_WIDTHS = (10.0, 7.0, 5.0, 4.0)  # of the kernel on the way there, sigmas
 NEAR_DEG, NEAR_SHIFT = 2.0, 0.08  # how far that may be: degrees, radii
+
+CONTRADICTING_SIGMAS = 3.0  # behind the surface, from which it is asked whether an edge hides a point
+STEEPEST = 5.0  # change of distance from place to place, in their width, beyond which a surface has an edge
+MOST_PLACES_HIDDEN = 32  # of the lattice from a point to the edge that hides it
 
 JUDGED, ABSENT, UNDECODED, HIDDEN = 1, 2, 3, 4  # codes of points that are in view
 
@@ -147,8 +153,9 @@ def frame_evidence(cloud: FrameCloud) -> FrameEvidence:
     radius = float(np.sqrt(((visible - centroid) ** 2).sum(-1).mean()))
     return FrameEvidence(
         camera, np.ascontiguousarray(surface), _in_blocks(errors, normal, known), find_empty_places(cloud, camera),
-        np.ascontiguousarray(points), place,
-        centroid, radius, max(CORRELATION_AREA / step**2, len(place) / INDEPENDENT, 1.0), float(np.median(sigma[usable])) if usable.any() else 1.0,
+        np.ascontiguousarray(points), place, centroid, radius,
+        max(CORRELATION_AREA / step**2, len(place) / INDEPENDENT, 1.0),
+        float(np.median(sigma[usable])) if usable.any() else 1.0,
     )  # fmt: skip
 
 
@@ -209,8 +216,8 @@ def _relief(distance: Float64[ndarray, "h w"]) -> Float64[ndarray, "h w"]:
 
 @compiled_range
 def _residuals(
-    first, last, points, scale, R, t, reverse, own, other, surface, smooth, block, code, camera, empty, light, hidden, least_facing,
-    least_lit, centre, widths, usual, z, codes, spread, H, g
+    first, last, points, scale, R, t, reverse, own, other, surface, smooth, block, code, camera, empty, light, hidden,
+    least_facing, least_lit, centre, widths, usual, z, codes, spread, H, g
 ):  # fmt: skip
     """Residual and code of every point under every similarity; adds weighted normal equations where `widths` > 0.
 
@@ -293,6 +300,15 @@ def _residuals(
             sigma = np.sqrt(float(surface[nv, nu, 1]) ** 2 + (ea * points[m, 6]) ** 2 + twist * twist)
             codes[k, m] = 1
             r = rho / sigma
+            if (
+                width <= 0
+                and r > CONTRADICTING_SIGMAS
+                and _behind_edge(
+                    X, Y, Z, rho, shift, surface, code, camera, max(d00, d01, d10, d11) - min(d00, d01, d10, d11)
+                )
+            ):
+                codes[k, m] = 4
+                continue
             z[k, m] = r
             spread[k, m] = sigma / usual
             if width <= 0 or abs(r) > 4 * width:
@@ -321,6 +337,42 @@ def _residuals(
                 g[k, i] += scaled * r
                 for j in range(i + 1):
                     H[k, i, j] += scaled * J[j]
+
+
+@compiled
+def _behind_edge(X, Y, Z, rho, eye, surface, code, camera, jump):
+    """Whether a point that lies behind the surface is hidden by an edge of it, and seen past that edge from `eye`.
+
+    On the way towards the other camera the point comes out from behind the surface: through it, or where its distance
+    jumps. `jump`: of the distances around the point.
+    """
+    h, w = surface.shape[0], surface.shape[1]
+    d = np.sqrt(X * X + Y * Y + Z * Z)
+    a, b, c = eye[0] - X, eye[1] - Y, eye[2] - Z
+    far = np.sqrt(a * a + b * b + c * c)
+    a, b, c = a / far, b / far, c / far
+    along = (a * X + b * Y + c * Z) / d
+    sine = np.sqrt(max(1 - along * along, 1e-12))
+    column, row, front = pixel_of(code, X, Y, Z, camera)
+    short = 1e-3 * d
+    column_1, row_1, front = pixel_of(code, X + short * a, Y + short * b, Z + short * c, camera)
+    step = short / max(np.sqrt((column_1 - column) ** 2 + (row_1 - row) ** 2), 1e-9)  # by a place of the lattice
+    steepest = STEEPEST * step * sine  # change of distance from place to place
+    if jump > steepest:
+        return True
+    last = float(surface[int(row), int(column), 0])
+    for n in range(1, MOST_PLACES_HIDDEN + 1):
+        x, y, z = X + n * step * a, Y + n * step * b, Z + n * step * c
+        column, row, front = pixel_of(code, x, y, z, camera)
+        if not (front and column >= 0 and row >= 0 and column < w and row < h):
+            return True
+        here = float(surface[int(row), int(column), 0])
+        if not np.isfinite(here) or abs(here - last) > steepest:
+            return True
+        if np.sqrt(x * x + y * y + z * z) <= here:
+            return False
+        last = here
+    return False
 
 
 @compiled
@@ -389,27 +441,23 @@ class Compared:
     z: Float32[ndarray, "k n"]
     codes: Int8[ndarray, "k n"]
     spread: Float32[ndarray, "k n"]  # sigma of each residual, relative to what is usual on smooth surface
+    indistinct: float = 0.0  # sigmas: residuals within say nothing of the place
 
     @cached_property
     def density(self) -> Float32[ndarray, "k n"]:
-        """Of the residuals of points that lie on the other frame's surface.
+        """Of the residuals of points that lie on the other frame's surface."""
+        return density(np.abs(self.z), self.spread)
 
-        Beside edges the decoder is wrong more often.
-        """
-        size = np.minimum(np.abs(self.z), np.float32(LARGEST_RESIDUAL))
-        wide = np.clip(self.spread, 1, LARGEST_SPREAD)
-        wrong, tail = WRONG_SHARE * wide, TAIL_SHARES[1] * wide
-        shares = 1 - wrong - tail - TAIL_SHARES[0], TAIL_SHARES[0], tail
-        found = wrong / np.float32(2 * LARGEST_RESIDUAL)
-        for share, sigma in zip(shares, TAIL_SIGMAS.tolist(), strict=True):
-            found += (
-                share * np.float32(1 / sigma / np.sqrt(2 * np.pi)) * np.exp(np.float32(-0.5 / sigma**2) * size * size)
-            )
-        return found
+    @cached_property
+    def contrast(self) -> Float32[ndarray, "k n"]:
+        """Log-density by which places are compared, relative to that of a residual as it usually is."""
+        least = max(self.indistinct, USUAL_SIGMAS)
+        usual = density(np.full_like(self.z, least), self.spread)
+        return np.log(density(np.maximum(np.abs(self.z), self.indistinct), self.spread) / usual)
 
     def chosen(self, index: Int64[ndarray, "m"]) -> "Compared":
         """Some of the places."""
-        return Compared(self.z[index], self.codes[index], self.spread[index])
+        return replace(self, z=self.z[index], codes=self.codes[index], spread=self.spread[index])
 
     def noise(self, k: int, points: slice) -> float:
         """How much larger the residuals of some points are at a place than stated; at least 1."""
@@ -420,11 +468,23 @@ class Compared:
 
     def scaled(self, noise: Float64[ndarray, "n"]) -> "Compared":
         """Residuals in units of what they are found to be."""
-        return Compared(self.z / noise.astype(np.float32), self.codes, self.spread)
+        return replace(self, z=self.z / noise.astype(np.float32))
 
     def overlaps(self, other: "Compared", share: float) -> bool:
         """Whether the first place lets at least a share of the points be judged that the other's does."""
         return (self.codes[0] == JUDGED).sum() >= share * (other.codes[0] == JUDGED).sum()
+
+
+def density(size: Float32[ndarray, "*n"], spread: Float32[ndarray, "*n"]) -> Float32[ndarray, "*n"]:
+    """Of residuals in the right place, by their absolute values; beside edges the decoder is wrong more often."""
+    size = np.minimum(size, np.float32(LARGEST_RESIDUAL))
+    wide = np.clip(spread, 1, LARGEST_SPREAD)
+    wrong, tail = WRONG_SHARE * wide, TAIL_SHARES[1] * wide
+    shares = 1 - wrong - tail - TAIL_SHARES[0], TAIL_SHARES[0], tail
+    found = wrong / np.float32(2 * LARGEST_RESIDUAL)
+    for share, sigma in zip(shares, TAIL_SIGMAS.tolist(), strict=True):
+        found += share * np.float32(1 / sigma / np.sqrt(2 * np.pi)) * np.exp(np.float32(-0.5 / sigma**2) * size * size)
+    return found
 
 
 def density_elsewhere(z: Float32[ndarray, "*n"]) -> Float32[ndarray, "*n"]:
@@ -464,6 +524,41 @@ class Commonness:
         return float(np.clip(self.absent / max(self.judged, 1.0), LEAST_ABSENT, 0.5))
 
 
+@dataclass(frozen=True)
+class Comparison:
+    """Places of two frames, or of two groups of frames, compared: log-likelihoods, nats.
+
+    Points that both of two places judge are compared with themselves. What only one of them judges counts as against
+    elsewhere. That is worth nothing where the surface looks the same at both: frames that show two such sides agree
+    without a surface in common. What contradicts always counts.
+    """
+
+    shared: Float64[ndarray, "k k"]  # of the points that both judge: of a place (row) against another (column)
+    own: Float64[ndarray, "k k"]  # against elsewhere, of the points that only the first judges
+    odds: Float64[ndarray, "k"]  # of each place against elsewhere
+    alike: Bool[ndarray, "k k"]  # some frames agree at both places, and nothing tells these apart
+
+    @property
+    def leads(self) -> Float64[ndarray, "k k"]:
+        """By how many nats each place (row) is more likely than each other (column)."""
+        own = np.where(self.alike, np.minimum(self.own, 0), self.own)
+        return self.shared + own - own.T
+
+    def __add__(self, other: "Comparison") -> "Comparison":
+        return Comparison(
+            self.shared + other.shared, self.own + other.own, self.odds + other.odds, self.alike | other.alike
+        )
+
+    def scaled(self, weight: float) -> "Comparison":
+        """Of evidence that counts less."""
+        return Comparison(weight * self.shared, weight * self.own, weight * self.odds, self.alike)
+
+    @staticmethod
+    def none(count: int) -> "Comparison":
+        """Places of which nothing is known."""
+        return Comparison(*np.zeros((2, count, count)), np.zeros(count), np.zeros((count, count), dtype=bool))
+
+
 class PairEvidence:
     """Two frames that are compared."""
 
@@ -492,8 +587,9 @@ class PairEvidence:
             model, parameters = for_loops(seen.camera)
             _residuals(
                 k, points, places.scale, R, t, bool(reverse), own[reverse], own[1 - reverse], seen.surface,
-                seen.smooth, BLOCK, model, parameters, seen.nothing.empty, seen.nothing.light, seen.hidden, LEAST_FACING_COSINE,
-                LEAST_LIT_COSINE, self.target.centroid, width, seen.usual_sigma, z, code, spread, H, g,
+                seen.smooth, BLOCK, model, parameters, seen.nothing.empty, seen.nothing.light, seen.hidden,
+                LEAST_FACING_COSINE, LEAST_LIT_COSINE, self.target.centroid, width, seen.usual_sigma, z, code, spread,
+                H, g,
             )  # fmt: skip
             zs.append(z)
             codes.append(code)
@@ -568,19 +664,20 @@ class PairEvidence:
         absent = np.log(ABSENT_SHARE / gone)
         return np.where(found.codes == JUDGED, seen, np.where(found.codes == ABSENT, absent, 0))
 
-    def comparison(self, found: Compared, common: tuple[Commonness, Commonness]) -> Float64[ndarray, "k k"]:
-        """By how many nats each place (row) is more likely than each other (column).
-
-        Points that both places judge are compared with themselves: how much of a surface is seen says nothing. What
-        only one of them judges counts as against elsewhere.
-        """
+    def comparison(self, found: Compared, common: tuple[Commonness, Commonness]) -> "Comparison":
+        """Compare each place with each other."""
         known = (found.codes == JUDGED) | (found.codes == ABSENT)
-        each = np.where(found.codes == ABSENT, np.log(ABSENT_SHARE) + USUAL_LOG_DENSITY, np.log(found.density))
+        each = np.where(found.codes == ABSENT, np.log(ABSENT_SHARE), found.contrast)
         J = known.astype(np.float32)
         alone = (self._against_elsewhere(found, common) / self.area).astype(np.float32)
         L = np.where(known, each / self.area, 0).astype(np.float32)
-        ahead = L @ J.T + alone @ (1 - J).T
-        return (ahead - ahead.T).astype(np.float64)
+        shared = (L @ J.T).astype(np.float64)
+        odds, own = alone.sum(1).astype(np.float64), (alone @ (1 - J).T).astype(np.float64)
+        count = J @ J.T
+        seen = count >= LEAST_SEEN * np.maximum.outer(np.diag(count), np.diag(count))
+        likely = odds > LEAST_ODDS
+        alike = seen & np.logical_and.outer(likely, likely) & (np.abs(shared - shared.T) < LEAST_ODDS)
+        return Comparison(shared - shared.T, own, odds, alike)
 
     def noise(self, found: Compared, k: int) -> tuple[float, float]:
         """How much larger residuals are at a place than stated: of the source's points, of the target's."""
@@ -603,11 +700,11 @@ class PairEvidence:
                 if here.sum() >= FEWEST_JUDGED:
                     own = np.quantile(np.abs(z[k][here]), NOISE_QUANTILES[0]) / NOISE_RESIDUALS[0]
                     z[k][here] /= np.clip(own, 1 / LARGEST_SHARED, LARGEST_SHARED)
-        return Compared(z, found.codes, found.spread)
+        return Compared(z, found.codes, found.spread, INDISTINCT_SIGMAS)
 
     def by_likelihood(self, found: Compared) -> Float64[ndarray, "k"]:
         """By how many nats each place leads the others, at worst; of places that see enough of each other's surface."""
-        worst = self.comparison(found, self.commonness(found))
+        worst = self.comparison(found, self.commonness(found)).leads
         np.fill_diagonal(worst, np.inf)
         judged = (found.codes == JUDGED).sum(1)
         agreeing = ((found.codes == JUDGED) & (np.abs(found.z) < AGREEING_SIGMAS)).sum(1)
@@ -619,7 +716,7 @@ class PairEvidence:
         """By how many nats the first place of one is more likely than that of another, on points that both judge."""
         a, b = first.codes[0], other.codes[0]
         both = (a == JUDGED) & (b == JUDGED)
-        ratio = np.where(both, np.log(first.density[0]) - np.log(other.density[0]), 0)
+        ratio = np.where(both, first.contrast[0] - other.contrast[0], 0)
         gone = np.log(ABSENT_SHARE) * (((a == ABSENT) & (b == JUDGED)) * 1.0 - ((b == ABSENT) & (a == JUDGED)))
         return float(((ratio + gone) / self.area).sum())
 
@@ -632,21 +729,20 @@ class ScanEvidence:
     ) -> None:
         self.frames, self.common, self.noise = frames, common, noise
 
-    def comparison(
-        self, source: int, target: int, places: Sequence[Similarity | None]
-    ) -> tuple[Float64[ndarray, "k k"], Float64[ndarray, "k"]]:
-        """By how many nats each place leads each other, and elsewhere; None: there the frames do not face each other."""
-        total, alone = np.zeros((len(places), len(places))), np.zeros(len(places))
+    def comparison(self, source: int, target: int, places: Sequence[Similarity | None]) -> Comparison:
+        """Compare places of two frames; None: there the frames do not face each other."""
+        every = Comparison.none(len(places))
         here = [k for k, S in enumerate(places) if S is not None]
         found = self._near(source, target, [S for S in places if S is not None])
         if found is None:
-            return total, alone
+            return every
         evidence, compared = found
-        common = self.common[source], self.common[target]
-        alone[here] = evidence.log_odds(compared, common)
-        total += alone[:, None] - alone
-        total[np.ix_(here, here)] = evidence.comparison(compared, common)
-        return total, alone
+        part = evidence.comparison(compared, (self.common[source], self.common[target]))
+        every.odds[here] = part.odds
+        every.own[:] = every.odds[:, None]
+        for whole, some in ((every.shared, part.shared), (every.own, part.own), (every.alike, part.alike)):
+            whole[np.ix_(here, here)] = some
+        return every
 
     def agreement(self, source: int, target: int, place: Similarity) -> tuple[float, float, float]:
         """Log-odds of a place; points of both frames that agree there, and that should, in frames: 1 is all of one."""

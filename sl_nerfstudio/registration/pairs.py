@@ -1,9 +1,9 @@
 """Registration of two frames by a similarity: proposals from a search and a walk, compared by their likelihood.
 
 The search starts from many rotations and refines point-to-plane distances on coarse surfaces, with projective
-association (Blais and Levine, PAMI 1995), both ways. Its ends, and the places along the motion that surfaces know least,
-are refined on what the frames decoded and compared there (see evidence). The logarithm of the scale has a prior: each
-frame's baseline has an unknown length, but a free scale would collapse a surface onto a patch.
+association (Blais and Levine, PAMI 1995), both ways. Its ends, and the places along the motion that surfaces know
+least, are refined on what the frames decoded and compared there (see evidence). The logarithm of the scale has a prior:
+each frame's baseline has an unknown length, but a free scale would collapse a surface onto a patch.
 """
 
 import math
@@ -31,6 +31,7 @@ from sl_nerfstudio.registration.agreement import (
 from sl_nerfstudio.registration.evidence import (
     ABSENT,
     JUDGED,
+    LEAST_ODDS,
     LEAST_SEEN,
     Commonness,
     Frame,
@@ -83,14 +84,14 @@ SEARCH_WIDTHS = (60.0, 40.0, 25.0, 15.0, 10.0, 7.0, 5.0, 4.0)
 WALK_WIDTHS = (8.0, 5.0, 4.0)
 FINE_WIDTHS = (4.0, 3.0, 3.0)
 STEP_DEG = 2.0  # of a walk: the peak that a feature makes is about as wide
+WIDEST_STEP_DEG = 6.0  # between likely places of one motion along which frames slip
 MOST_STEPS = 90  # in each sense: half a turn
 FINE_STEPS = 9  # between the steps of a walk before and after the best place
 LEAST_STRAIGHT = 0.7  # cosine between the axes of two steps
 LEAST_OVERLAP_OF_WALK = 0.25  # points that can be judged, relative to the start
 SAME_START_DEG = 1.0  # rotation between two ends of the search below which they are one
 SAME_PLACE_DEG, SAME_PLACE_SHIFT = 3.0, 0.1  # rotation and shift (radii) below which two places are one
-LEAST_ODDS = 10.0  # nats that decide: errors of the decoder that pixels share make wrong places lead by a few
-MOST_BEHIND = 80.0  # nats behind the best from which a place is no rival
+MOST_BEHIND = 60.0  # nats behind the best from which a place is no rival
 
 # Uncertainty of a pair.
 BOUNDED_SLIP_DEG = 4.0  # up to which several pairs together connect frames: an uncertainty like any other
@@ -320,8 +321,8 @@ def best_match(evidence: PairEvidence, starts: Places, pair: tuple[int, int]) ->
     best = int(same[np.argmax(evidence.by_likelihood(raw.chosen(same)))])
     turned, shifted = differences(places, places[[best]], target)
     common = evidence.commonness(found.chosen(np.flatnonzero((turned > SAME_PLACE_DEG) | (shifted > SAME_PLACE_SHIFT))))
-    odds = -evidence.comparison(found, common)[best]
-    alone = float(evidence.log_odds(found.chosen(np.array([best])), common)[0])
+    compared = evidence.comparison(found, common)
+    odds, alone = -compared.leads[best], float(compared.odds[best])
     judged = (found.codes == JUDGED).sum(1)
     odds = np.where(judged >= LEAST_SEEN * judged[best], odds, -np.inf)
     different: list[int] = []
@@ -330,7 +331,7 @@ def best_match(evidence: PairEvidence, starts: Places, pair: tuple[int, int]) ->
         if ((apart[0] > SAME_PLACE_DEG) | (apart[1] > SAME_PLACE_SHIFT)).all() and odds[k] > odds[best] - MOST_BEHIND:
             different.append(k)
     likely = odds > odds[best] - LEAST_ODDS
-    slip = float(turned[likely & (shifted < 1.0)].max())
+    slip = _slip_deg(turned[likely & (shifted < 1.0)])
     direction = weakest_rotation(similarity_information(H[best]))[0]
     codes, z = found.codes[best], np.abs(found.z[best])  # in units of the noise that was found
     agreeing = float(((codes == JUDGED) & (z < AGREEING_SIGMAS)).mean())
@@ -343,8 +344,16 @@ def best_match(evidence: PairEvidence, starts: Places, pair: tuple[int, int]) ->
     return PairMatch(
         *pair, places.similarity(best), np.linalg.inv(covariance), agreeing, agreeing / max(expected, 1e-9),
         alone, tuple(Rival(places.similarity(k), float(odds[k] - odds[best])) for k in different[:MOST_RIVALS]),
-        float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))), slip if slips else 0.0, direction, common, noise,
+        float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))), slip if slips else 0.0,
+        direction, common, noise,
     )  # fmt: skip
+
+
+def _slip_deg(turned: Float64[ndarray, "k"]) -> float:
+    """The largest of the turns that small steps from none lead to."""
+    way = np.sort(np.append(turned, 0.0))
+    wide = np.flatnonzero(np.diff(way) > WIDEST_STEP_DEG)
+    return float(way[wide[0]] if len(wide) else way[-1])
 
 
 def differences(
@@ -374,8 +383,8 @@ def distinct_places(places: Places, ranked: list[int], target: FrameEvidence) ->
     return kept
 
 
-# A walk along the motion that two frames know least: about the axis of what is nearly round, features make a narrow peak
-# that no slope leads to, and no search with steps of many degrees meets.
+# A walk along the motion that two frames know least: about the axis of what is nearly round, features make a narrow
+# peak that no slope leads to, and no search with steps of many degrees meets.
 
 
 def similarity_information(H: Float64[ndarray, "17 17"]) -> Float64[ndarray, "7 7"]:
@@ -386,8 +395,9 @@ def similarity_information(H: Float64[ndarray, "17 17"]) -> Float64[ndarray, "7 
 def weakest_rotation(
     information: Float64[ndarray, "7 7"],
 ) -> tuple[Float64[ndarray, "7"], Float64[ndarray, "3"]]:
-    """The increment (v, w, l) with |w| = 1 that is known least, with translation and scale free to follow, and what is
-    known of all rotations, smallest first.
+    """The increment (v, w, l) with |w| = 1 that is known least, and the information on all rotations, smallest first.
+
+    Translation and scale are free to follow.
     """
     other = [0, 1, 2, 6]
     follow = -np.linalg.lstsq(information[np.ix_(other, other)], information[other][:, 3:6], rcond=1e-10)[0]

@@ -17,11 +17,7 @@ from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, angle_deg
 from sl_nerfstudio.parallel import one_library_thread, results, tracked
 from sl_nerfstudio.registration.agreement import PENALTY
-from sl_nerfstudio.registration.assembly import (
-    Component,
-    PoseGraphSolution,
-    facing,
-)
+from sl_nerfstudio.registration.assembly import facing
 from sl_nerfstudio.registration.evidence import Frame, ScanEvidence
 from sl_nerfstudio.registration.pairs import (
     ANYWHERE,
@@ -36,11 +32,12 @@ from sl_nerfstudio.registration.pairs import (
     register_pair,
     search_score,
 )
+from sl_nerfstudio.registration.pose_graph import Component, PoseGraphSolution
 from sl_nerfstudio.registration.result import (
     Edge,
     Exclusion,
     NoCommonSurface,
-    PairsContradict,
+    OpenPlace,
     PoorPair,
     Registration,
     SeparateComponent,
@@ -57,7 +54,6 @@ SEQUENCE_GAPS = (1, 2)  # differences between the numbers of frames that are pai
 ROUNDS = 2  # of closing cycles
 LEAST_JOINED = 0.5  # share of successive frames that must be joined for their order to be that of capture
 FACING = 8  # frames with which each is compared at last
-MOST_DOUBTFUL = 0.25  # share of the frames most of whose pairs contradict the pose found; more: the pairs are to blame
 LARGEST_SIGMA_ROTATION_DEG = 3.0  # standard deviation of the least known rotation beyond which it is uncertain
 UNKNOWN_SIGMA_ROTATION_DEG = 104.0  # the same where the rotation is unobservable: of all angles from -180 to 180
 REACH = 2  # frames before and after one with which each pose of its projector is compared
@@ -132,10 +128,7 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
     scan = graph.evidence()
     tasks = [partial(_support_of, k, solution, scan) for k in range(len(names))]
     odds, fitness = np.array(results(tasks)).T
-    agrees = connected & (odds > LEAST_ODDS)
-    doubts = _doubtful(names, agrees, edges, solution.consistent)
-    few = len(doubts) <= MOST_DOUBTFUL * agrees.sum()
-    registered = agrees & ~np.isin(np.arange(len(names)), list(doubts)) if few else agrees
+    registered = connected & (odds > LEAST_ODDS)
     poses, baseline = _in_first_camera(solution.S_world_camera, registered)
     index: list[int] = np.flatnonzero(registered).tolist()
     consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
@@ -155,9 +148,7 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
             for e, used in zip(edges, solution.consistent, strict=True)
         ),
         tuple(
-            doubts[k]
-            if agrees[k]
-            else SurfaceDisagrees(names[k], float(fitness[k]))
+            SurfaceDisagrees(names[k], float(fitness[k]))
             if connected[k]
             else _exclusion(k, names, components, main, graph)
             for k in np.flatnonzero(~registered).tolist()
@@ -168,21 +159,6 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
         ordered,
         graph.by_order,
     )  # fmt: skip
-
-
-def _doubtful(
-    names: Sequence[str], inside: Bool[ndarray, "n"], edges: Sequence[PairMatch], consistent: Bool[ndarray, "edges"]
-) -> dict[int, PairsContradict]:
-    """Frames most of whose pairs with others, counted by how well they fit, contradict the solution."""
-    found = {}
-    frames: list[int] = np.flatnonzero(inside).tolist()
-    for k in frames:
-        mine = [(e, bool(u)) for e, u in zip(edges, consistent, strict=True) if k in (e.source, e.target)]
-        mine = [(e, used) for e, used in mine if inside[e.other(k)] and not is_ambiguous(e)]
-        against = [e for e, used in mine if not used]
-        if math.fsum(e.log_odds for e in against) > math.fsum(e.log_odds for e, used in mine if used):
-            found[k] = PairsContradict(names[k], len(mine), len(against))
-    return found
 
 
 def _separate_poses(names: Sequence[str], component: Component, graph: ViewGraph) -> SeparatePoses:
@@ -251,6 +227,9 @@ def _exclusion(
         if (e.source in main and e.target in component) or (e.target in main and e.source in component)
     ]
     partner = names[max(across, key=lambda pair: pair[0].log_odds)[1]] if across else None
+    if (block := next((one for one in graph.open if k in one.nodes), None)) is not None:
+        group = tuple(names[j] for j in block.nodes)
+        return OpenPlace(names[k], group, block.turn_deg, block.log_odds, partner)
     # where no two frames could be joined, every pair of the frame might have joined it
     joining = [e for e in ([e for e, _ in across] if main else mine) if is_accepted(e)]
     slips = bool(joining) and all(e.slip_deg > 0 for e in joining)
@@ -310,7 +289,7 @@ def include_left_out(
     }
     for k in left_out:
         graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), ANYWHERE)
-    assembly = graph.assembly([e for e in graph.edges if e.holds])
+    assembly = graph.assembly([e for e in graph.edges if e.holds], graph.evidence())
     placed: Component = {}
     singles: list[Component] = [{k: Similarity.identity()} for k in left_out]
     for block in (*_blocks(registration, left_out), *singles):

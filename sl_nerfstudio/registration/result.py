@@ -68,12 +68,14 @@ class PoorPair:
 
 
 @dataclass(frozen=True)
-class PairsContradict:
-    """A frame was left out because most of its pairs, counted by how well they fit, place it elsewhere."""
+class OpenPlace:
+    """A frame was left out because it is nearly as likely to belong elsewhere."""
 
     frame: str
-    pairs: int  # with registered frames
-    contradicting: int
+    group: tuple[str, ...]  # frames that would move with it
+    turn_deg: float  # by which they may be turned against the rest
+    log_odds: float  # of the likelier place, nats
+    partner: str | None  # the frame of the rest with which it shares most
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ Exclusion = (
     | NoCommonSurface
     | SeparateComponent
     | PoorPair
-    | PairsContradict
+    | OpenPlace
     | CoordinatesDisagree
     | UndecidedProjector
 )

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import PoseGraphSolution
 from sl_nerfstudio.registration.pairs import LEAST_ODDS, PairMatch
+from sl_nerfstudio.registration.pose_graph import PoseGraphSolution
 
 LEAST_TURN_DEG = 20.0  # between two sides
 SAME_TURN_DEG = 8.0  # between two turns below which they are one

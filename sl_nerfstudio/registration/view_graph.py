@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -13,14 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.parallel import tracked
 from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, COARSE_POINTS, Side, Tolerance, agreement_at
-from sl_nerfstudio.registration.assembly import (
-    Assembly,
-    Component,
-    Pivots,
-    PoseGraphSolution,
-    optimise_pose_graph,
-    see_same_side,
-)
+from sl_nerfstudio.registration.assembly import Assembly, see_same_side
+from sl_nerfstudio.registration.blocks import BlockReview, OpenBlock
 from sl_nerfstudio.registration.evidence import Commonness, Frame, ScanEvidence
 from sl_nerfstudio.registration.pairs import (
     ANYWHERE,
@@ -36,6 +31,13 @@ from sl_nerfstudio.registration.pairs import (
     register_pair,
     search_score,
 )
+from sl_nerfstudio.registration.pose_graph import (
+    Component,
+    Pivots,
+    PoseGraphSolution,
+    at_places,
+    optimise_pose_graph,
+)
 from sl_nerfstudio.registration.surfaces import SurfaceMap
 
 EXPECTED_OVERLAP = 0.25  # share of common surface that makes a pair worth registering
@@ -49,7 +51,9 @@ BRIDGES_COMPARED = 40  # pairs across of which those that look most alike are ch
 BRIDGES_NEARBY = 3  # how many of the bridges are pairs taken one soon after the other
 LEAST_STEPS = 0.5  # share of the successive frames that must fit each other for their usual step to be known
 LEAST_STEP_DEG = 2.0  # of successive frames
-STEPS_SIGMA = 1.0  # of the prior: one usual step
+FEWEST_DECIDED, LEAST_DECIDED = 4, 0.2  # successive frames, and their share, by which the usual step is known
+NORMAL_MEDIAN = 0.6745  # of absolute values of a standard normal distribution
+LEAST_SPREAD = 0.3  # of the usual step, relative to it
 LARGEST_GAP = 2  # between frames of which the order of capture says something
 MOST_BY_ORDER = 25.0  # nats against a place by the order: someone may have walked to the other side
 LEAST_DISTANCE = 0.2  # of a camera from the object, relative to the median, for its rough pose to be used
@@ -128,6 +132,14 @@ def with_common_centre(S_world_camera: Component, maps: Sequence[SurfaceMap]) ->
 Pair = tuple[int, int]
 
 
+@dataclass(frozen=True)
+class UsualStep:
+    """The angle by which cameras of successive frames usually turn, and its standard deviation, degrees."""
+
+    deg: float
+    sigma_deg: float
+
+
 class ViewGraph:
     """Pairs that were tried, with the best result of each."""
 
@@ -138,9 +150,10 @@ class ViewGraph:
         self._start = start  # S_world_camera of frames where it is known roughly
         self.pivots = Pivots(np.stack([m.centroid for m in self.maps]), np.array([m.radius for m in self.maps]))
         self.sides = [Side.sampled(m, COARSE_POINTS, rng) for m in self.maps]
-        self.step_deg: float | None = None  # by which successive frames usually turn; None: the order says nothing
+        self.step: UsualStep | None = None  # None: the order of capture says nothing
         self._tried: dict[Pair, PairMatch | None] = {}
         self._searched: set[tuple[Pair, Search]] = set()
+        self.open: list[OpenBlock] = []  # what the last assembly left undecided
         self.by_order = False  # the order of capture has decided places that surfaces did not
 
     @property
@@ -211,17 +224,27 @@ class ViewGraph:
         Pairs that may slip connect nothing, unless all of them may: then the surface is one of revolution, and its
         frames are put together all the same.
         """
-        edges = self.edges
-        assembly = self.assembly([e for e in edges if e.holds])
+        edges, scan = self.edges, self.evidence()
+        assembly = self.assembly([e for e in edges if e.holds], scan)
         components = assembly.grow()
-        self.by_order = assembly.by_order
-        if len(components[0]) > 1:
-            return components
-        return self.assembly(edges, slipping=True).grow()
+        if len(components[0]) == 1:
+            return self.assembly(edges, scan).grow()
+        found: list[Component] = []
+        self.by_order, self.open = False, []
+        for component in components:
+            if len(component) == 1:
+                found.append(component)
+                continue
+            edges = self.holding(component)
+            one = BlockReview(assembly, self.pivots, edges, component, self.usual_step).settled()
+            found += [one.decided, *(block.nodes for block in one.open)]
+            self.open += one.open
+            self.by_order |= one.by_order
+        return sorted(found, key=lambda c: (-len(c), min(c)))
 
-    def assembly(self, edges: Sequence[PairMatch], slipping: bool = False) -> Assembly:
+    def assembly(self, edges: Sequence[PairMatch], scan: ScanEvidence) -> Assembly:
         """Frames that pairs may join."""
-        return Assembly(self.evidence(), self.pivots, edges, self.usual_step, slipping)
+        return Assembly(scan, self.pivots, edges, self.usual_step)
 
     def evidence(self) -> ScanEvidence:
         """All frames, with what pairs have shown of their points."""
@@ -235,25 +258,34 @@ class ViewGraph:
         return ScanEvidence(frames, common, np.array([np.median(each) if each else 1.0 for each in noise]))
 
     def learn_step(self) -> None:
-        """How much successive frames usually turn: the median of the least turn that each pair of them allows."""
-        steps = [
-            min(angle_deg(S.R) for S in likely_places(e))
-            for e in self.edges
-            if abs(e.target - e.source) == 1 and e.holds
-        ]
-        enough = len(steps) > LEAST_STEPS * (len(self.frames) - 1)
-        self.step_deg = max(float(np.median(steps)), LEAST_STEP_DEG) if enough else None
+        """How much successive frames usually turn, by those whose turn surfaces decide.
+
+        Where they decide few, it is the least turn that each pair allows: small steps are likely.
+        """
+        pairs = [e for e in self.edges if abs(e.target - e.source) == 1 and e.holds]
+        if len(pairs) <= LEAST_STEPS * (len(self.frames) - 1):
+            self.step = None
+            return
+        decided = np.array([angle_deg(e.S_target_source.R) for e in pairs if e.lead >= LEAST_ODDS])
+        if len(decided) >= max(FEWEST_DECIDED, LEAST_DECIDED * len(pairs)):
+            usual = float(np.median(decided))
+            spread = float(np.median(np.abs(decided - usual))) / NORMAL_MEDIAN
+            self.step = UsualStep(usual, max(spread, LEAST_SPREAD * usual, LEAST_STEP_DEG))
+        else:
+            least = [min(angle_deg(S.R) for S in likely_places(e)) for e in pairs]
+            self.step = UsualStep(0.0, max(float(np.median(least)), LEAST_STEP_DEG))
 
     def usual_step(self, i: int, j: int, S_i_j: Similarity) -> float:
-        """Log-odds of the place of one frame on another by the order of capture: small steps are likely."""
+        """Log-odds of the place of one frame on another by the order of capture."""
         gap = abs(i - j)
-        if self.step_deg is None or gap > LARGEST_GAP:
+        if self.step is None or gap > LARGEST_GAP:
             return 0.0
-        return -min(0.5 * (angle_deg(S_i_j.R) / (STEPS_SIGMA * gap * self.step_deg)) ** 2, MOST_BY_ORDER)
+        off = (angle_deg(S_i_j.R) / gap - self.step.deg) / self.step.sigma_deg
+        return -min(0.5 * off**2, MOST_BY_ORDER)
 
     def solve(self, component: Component) -> PoseGraphSolution:
-        """A component with the pairs that hold it optimised together."""
-        edges = self.holding(component)
+        """A component with the pairs that hold it optimised together, each where its frames are."""
+        edges = at_places(self.holding(component), component)
         return optimise_pose_graph(edges, self.pivots, component, edge_weights(edges))
 
     def holding(self, component: Component) -> list[PairMatch]:
