@@ -26,7 +26,6 @@ from sl_nerfstudio.registration.pairs import (
 from sl_nerfstudio.registration.pose_graph import Component, Pivots, at_places, optimise_pose_graph
 
 MOST_COMPARED = 12  # clearly different similarities between two components
-SAME_TURN_DEG = 4.0  # between two rotations below which they are one
 MOST_PAIRS = 10  # of frames across two components that are compared
 LEAST_SIGHT_COSINE = float(np.cos(np.radians(75.0)))  # between lines of sight: beyond it frames share no surface
 
@@ -217,22 +216,15 @@ class Assembly:
         return min(shifts) > SAME_PLACE_SHIFT
 
 
-def log_odds_at(e: PairMatch, S: Similarity) -> float | None:
-    """Log-odds of a place of a pair against its best one, nats; None for places that the pair does not know."""
-    places = [(e.S_target_source, 0.0), *((r.S_target_source, r.log_odds) for r in e.rivals)]
-    near = [odds for T, odds in places if angle_deg(S.R @ T.R.T) <= SAME_TURN_DEG]
-    return max(near, default=None)
-
-
 def looks_alike(edges: Sequence[PairMatch], nodes: Component, turn: Similarity) -> bool:
     """Whether a pair of frames fits as well after one of them is moved by a turn of their world: as on a box."""
     inverse = turn.inverse()
     for e in edges:
         if e.rivals and e.source in nodes and e.target in nodes:
             back = nodes[e.target].inverse()
-            here = log_odds_at(e, back @ nodes[e.source])
+            here = e.log_odds_at(back @ nodes[e.source])
             for T in (turn, inverse):
-                there = log_odds_at(e, back @ T @ nodes[e.source])
+                there = e.log_odds_at(back @ T @ nodes[e.source])
                 if here is not None and there is not None and abs(here - there) < LEAST_ODDS:
                     return True
     return False

@@ -15,11 +15,11 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import SAME_TURN_DEG, Assembly, Prior, log_odds_at, looks_alike
-from sl_nerfstudio.registration.pairs import LEAST_ODDS, PairMatch, edge_weights
+from sl_nerfstudio.registration.assembly import Assembly, Prior, looks_alike
+from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_TURN_DEG, PairMatch, edge_weights
 from sl_nerfstudio.registration.pose_graph import Component, Pivots, at_places, optimise_pose_graph
 
-MOST_TURNS = 24  # of the world that are tried
+MOST_TURNS = 16  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
 LEAST_GAIN = 1.0  # nats by which a block must fit better elsewhere to be moved
 MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
@@ -42,6 +42,7 @@ class Settled:
     decided: Component
     open: tuple[OpenBlock, ...]  # in the same world
     by_order: bool  # surfaces alone would have left more open
+    turns_deg: tuple[float, ...]  # by which blocks may be turned, as far as surfaces tell
 
 
 @dataclass(frozen=True)
@@ -93,6 +94,7 @@ class BlockReview:
             {k: S for k, S in self.nodes.items() if k not in out},
             tuple(open_),
             sum(len(block.nodes) for block in without) > len(out),
+            _distinct(sorted(block.turn_deg for block in without)),
         )
 
     def _open(self, turns: Sequence[Turn], with_order: bool) -> list[OpenBlock]:
@@ -145,10 +147,10 @@ class BlockReview:
         alike = looks_alike(self._edges, self.nodes, turn)
         for e in self._edges:
             i, j, S = column[e.source], column[e.target], self.nodes[e.target].inverse()
-            here = log_odds_at(e, S @ self.nodes[e.source])
+            here = e.log_odds_at(S @ self.nodes[e.source])
             weight = 2 / (self._degree[e.source] + self._degree[e.target])  # see Assembly.compare
             for moved, kept, way in ((i, j, S @ turn), (j, i, S @ inverse)):
-                there = log_odds_at(e, way @ self.nodes[e.source])
+                there = e.log_odds_at(way @ self.nodes[e.source])
                 if not (alike and (here is None or there is None)):  # see Comparison
                     before, after = (-MOST_AGAINST if odds is None else odds for odds in (here, there))
                     surface[moved, kept] += weight * (after - before)
@@ -162,6 +164,15 @@ class BlockReview:
         return Turn(turn, alike, surface, order)
 
 
+def _distinct(sorted_deg: Sequence[float]) -> tuple[float, ...]:
+    """Angles without those that are close to the one before."""
+    found: list[float] = []
+    for angle in sorted_deg:
+        if not found or angle > found[-1] + SAME_TURN_DEG:
+            found.append(angle)
+    return tuple(found)
+
+
 def optimised(edges: Sequence[PairMatch], pivots: Pivots, nodes: Component) -> Component:
     """All pairs optimised together, each at its place nearest to where its frames are."""
     placed = at_places(edges, nodes)
@@ -173,7 +184,7 @@ def turns_said(edges: Sequence[PairMatch], nodes: Component) -> list[Similarity]
     said: list[tuple[float, Similarity]] = []
     for e in edges:
         target, source = nodes[e.target], nodes[e.source].inverse()
-        here = log_odds_at(e, target.inverse() @ nodes[e.source])
+        here = e.log_odds_at(target.inverse() @ nodes[e.source])
         here = -MOST_AGAINST if here is None else here
         for S, odds in [(e.S_target_source, 0.0), *((r.S_target_source, r.log_odds) for r in e.rivals)]:
             turn = target @ S @ source

@@ -36,7 +36,7 @@ from sl_nerfstudio.relative_pose.epipolar import directions
 LARGEST_SIDE = 640  # places of the lattice along the image's longer side
 POINTS = 2000  # of a frame that are compared, about
 INDEPENDENT = 300.0  # points of a frame that count as independent at most
-CORRELATION_AREA = 120.0  # places whose errors are one: the decoder looks at windows
+CORRELATION_AREA = 120.0  # places whose errors are one, of the largest lattice: the decoder looks at windows
 NORMAL_REACH = (2, 4)  # places on each side over which normals are differences: the widest that is known
 BLOCK = 4  # places along each side of a block whose normal and pose errors are one
 RELIEF_REACH = 6  # places on each side over which the relief is measured
@@ -154,7 +154,7 @@ def frame_evidence(cloud: FrameCloud) -> FrameEvidence:
     return FrameEvidence(
         camera, np.ascontiguousarray(surface), _in_blocks(errors, normal, known), find_empty_places(cloud, camera),
         np.ascontiguousarray(points), place, centroid, radius,
-        max(CORRELATION_AREA / step**2, len(place) / INDEPENDENT, 1.0),
+        max(CORRELATION_AREA * (max(w, h) / LARGEST_SIDE) ** 2 / step**2, len(place) / INDEPENDENT, 1.0),
         float(np.median(sigma[usable])) if usable.any() else 1.0,
     )  # fmt: skip
 
@@ -704,7 +704,9 @@ class PairEvidence:
 
     def by_likelihood(self, found: Compared) -> Float64[ndarray, "k"]:
         """By how many nats each place leads the others, at worst; of places that see enough of each other's surface."""
-        worst = self.comparison(found, self.commonness(found)).leads
+        # places close to a right one fit as well: what only one place sees counts where it contradicts
+        compared = self.comparison(found, self.commonness(found))
+        worst = replace(compared, alike=np.ones_like(compared.alike)).leads
         np.fill_diagonal(worst, np.inf)
         judged = (found.codes == JUDGED).sum(1)
         agreeing = ((found.codes == JUDGED) & (np.abs(found.z) < AGREEING_SIGMAS)).sum(1)

@@ -9,6 +9,7 @@ each frame's baseline has an unknown length, but a free scale would collapse a s
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64
@@ -87,10 +88,12 @@ STEP_DEG = 2.0  # of a walk: the peak that a feature makes is about as wide
 WIDEST_STEP_DEG = 6.0  # between likely places of one motion along which frames slip
 MOST_STEPS = 90  # in each sense: half a turn
 FINE_STEPS = 9  # between the steps of a walk before and after the best place
+SAME_TURN_DEG = 4.0  # between two rotations below which they are one
 LEAST_STRAIGHT = 0.7  # cosine between the axes of two steps
 LEAST_OVERLAP_OF_WALK = 0.25  # points that can be judged, relative to the start
 SAME_START_DEG = 1.0  # rotation between two ends of the search below which they are one
 SAME_PLACE_DEG, SAME_PLACE_SHIFT = 3.0, 0.1  # rotation and shift (radii) below which two places are one
+EVEN_ODDS = 5.0  # nats within which residuals themselves choose
 MOST_BEHIND = 60.0  # nats behind the best from which a place is no rival
 
 # Uncertainty of a pair.
@@ -161,6 +164,20 @@ class PairMatch:
     def by_tone(self) -> bool:
         """Whether tones hold the frames where surfaces alone would let them slip."""
         return self.by_shape is not None
+
+    @cached_property
+    def _places(self) -> tuple[Float64[ndarray, "m 3 3"], Float64[ndarray, "m"]]:
+        """Rotations of all places, and their log-odds against the best one."""
+        return (
+            np.stack([self.S_target_source.R, *(rival.S_target_source.R for rival in self.rivals)]),
+            np.array([0.0, *(rival.log_odds for rival in self.rivals)]),
+        )
+
+    def log_odds_at(self, S: Similarity) -> float | None:
+        """Log-odds of a place against the best one, nats; None for places that the pair does not know."""
+        R, odds = self._places
+        near = np.einsum("mij,ij->m", R, S.R) >= 1 + 2 * math.cos(math.radians(SAME_TURN_DEG))
+        return float(odds[near].max()) if near.any() else None
 
     def between(self, source: int, target: int) -> Similarity:
         """The similarity from `source` to `target`, whichever way it was found."""
@@ -314,7 +331,9 @@ def best_match(evidence: PairEvidence, starts: Places, pair: tuple[int, int]) ->
     places, H = Places.joined([places, near]), np.concatenate([H, H_near])
     raw = evidence.compare(places)
     found = evidence.scaled(raw, noise := evidence.noise(raw, int(np.argmax(evidence.by_likelihood(raw)))))
-    best = int(np.argmax(evidence.by_likelihood(found)))
+    likelihood = evidence.by_likelihood(found)
+    even = np.flatnonzero(likelihood > likelihood.max() - EVEN_ODDS)
+    best = int(even[np.argmax(evidence.by_likelihood(raw.chosen(even)))])
     # which place it is, residuals in units of their own say; where exactly, the residuals themselves
     turned, shifted = differences(places, places[[best]], target)
     same = np.flatnonzero((turned <= SAME_PLACE_DEG) & (shifted <= SAME_PLACE_SHIFT))

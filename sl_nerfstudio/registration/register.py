@@ -47,7 +47,6 @@ from sl_nerfstudio.registration.result import (
     UndecidedProjector,
 )
 from sl_nerfstudio.registration.surfaces import FrameCloud
-from sl_nerfstudio.registration.symmetry import symmetric_turns_deg
 from sl_nerfstudio.registration.view_graph import ViewGraph, starting_similarities, with_common_centre
 
 SEQUENCE_GAPS = (1, 2)  # differences between the numbers of frames that are paired in a sequence
@@ -155,7 +154,7 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
         ),
         tuple(UncertainRotation(names[k], sigma[k]) for k in index if sigma[k] > LARGEST_SIGMA_ROTATION_DEG),
         tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
-        symmetric_turns_deg(edges, solution),
+        graph.turns_deg,
         ordered,
         graph.by_order,
     )  # fmt: skip

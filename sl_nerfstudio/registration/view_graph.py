@@ -1,5 +1,6 @@
 """The view graph: which pairs of frames have been registered with each other, and which to try next."""
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -51,8 +52,8 @@ BRIDGES_COMPARED = 40  # pairs across of which those that look most alike are ch
 BRIDGES_NEARBY = 3  # how many of the bridges are pairs taken one soon after the other
 LEAST_STEPS = 0.5  # share of the successive frames that must fit each other for their usual step to be known
 LEAST_STEP_DEG = 2.0  # of successive frames
-FEWEST_DECIDED, LEAST_DECIDED = 4, 0.2  # successive frames, and their share, by which the usual step is known
-NORMAL_MEDIAN = 0.6745  # of absolute values of a standard normal distribution
+STEPS_DEG = np.geomspace(1.0, 60.0, 60)  # that are compared
+UNUSUAL_DENSITY = 1e-3  # of a turn that is not the usual one, per degree
 LEAST_SPREAD = 0.3  # of the usual step, relative to it
 LARGEST_GAP = 2  # between frames of which the order of capture says something
 MOST_BY_ORDER = 25.0  # nats against a place by the order: someone may have walked to the other side
@@ -154,6 +155,7 @@ class ViewGraph:
         self._tried: dict[Pair, PairMatch | None] = {}
         self._searched: set[tuple[Pair, Search]] = set()
         self.open: list[OpenBlock] = []  # what the last assembly left undecided
+        self.turns_deg: tuple[float, ...] = ()  # after which surfaces look the same
         self.by_order = False  # the order of capture has decided places that surfaces did not
 
     @property
@@ -230,7 +232,7 @@ class ViewGraph:
         if len(components[0]) == 1:
             return self.assembly(edges, scan).grow()
         found: list[Component] = []
-        self.by_order, self.open = False, []
+        self.by_order, self.open, turns = False, [], set[float]()
         for component in components:
             if len(component) == 1:
                 found.append(component)
@@ -239,7 +241,9 @@ class ViewGraph:
             one = BlockReview(assembly, self.pivots, edges, component, self.usual_step).settled()
             found += [one.decided, *(block.nodes for block in one.open)]
             self.open += one.open
+            turns |= set(one.turns_deg)
             self.by_order |= one.by_order
+        self.turns_deg = tuple(sorted(turns))
         return sorted(found, key=lambda c: (-len(c), min(c)))
 
     def assembly(self, edges: Sequence[PairMatch], scan: ScanEvidence) -> Assembly:
@@ -258,22 +262,23 @@ class ViewGraph:
         return ScanEvidence(frames, common, np.array([np.median(each) if each else 1.0 for each in noise]))
 
     def learn_step(self) -> None:
-        """How much successive frames usually turn, by those whose turn surfaces decide.
-
-        Where they decide few, it is the least turn that each pair allows: small steps are likely.
-        """
-        pairs = [e for e in self.edges if abs(e.target - e.source) == 1 and e.holds]
-        if len(pairs) <= LEAST_STEPS * (len(self.frames) - 1):
+        """By how much successive frames usually turn: what makes the places that all their pairs allow most likely."""
+        pairs = [e for e in self.edges if abs(e.target - e.source) <= LARGEST_GAP and e.holds]
+        if sum(abs(e.target - e.source) == 1 for e in pairs) <= LEAST_STEPS * (len(self.frames) - 1):
             self.step = None
             return
-        decided = np.array([angle_deg(e.S_target_source.R) for e in pairs if e.lead >= LEAST_ODDS])
-        if len(decided) >= max(FEWEST_DECIDED, LEAST_DECIDED * len(pairs)):
-            usual = float(np.median(decided))
-            spread = float(np.median(np.abs(decided - usual))) / NORMAL_MEDIAN
-            self.step = UsualStep(usual, max(spread, LEAST_SPREAD * usual, LEAST_STEP_DEG))
-        else:
-            least = [min(angle_deg(S.R) for S in likely_places(e)) for e in pairs]
-            self.step = UsualStep(0.0, max(float(np.median(least)), LEAST_STEP_DEG))
+        steps = [UsualStep(deg, max(LEAST_SPREAD * deg, LEAST_STEP_DEG)) for deg in STEPS_DEG]
+        self.step = max(steps, key=lambda step: sum(self._log_likelihood(e, step) for e in pairs))
+
+    @staticmethod
+    def _log_likelihood(e: PairMatch, step: "UsualStep") -> float:
+        """Of a step, over the places that a pair allows; a few pairs turn by anything."""
+        angle = np.array([angle_deg(e.S_target_source.R), *(angle_deg(r.S_target_source.R) for r in e.rivals)])
+        odds = np.array([0.0, *(r.log_odds for r in e.rivals)])
+        odds = np.exp(odds - odds.max())
+        off = (angle / abs(e.target - e.source) - step.deg) / step.sigma_deg
+        usual = np.exp(-0.5 * off**2) / (step.sigma_deg * math.sqrt(2 * math.pi))
+        return math.log(float(((usual + UNUSUAL_DENSITY) * odds).sum() / odds.sum()))
 
     def usual_step(self, i: int, j: int, S_i_j: Similarity) -> float:
         """Log-odds of the place of one frame on another by the order of capture."""

@@ -1,7 +1,6 @@
 """Frames whose coordinates contradict the others after the joint adjustment: taken out, or moved to where they fit."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,27 +16,23 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
 )
 from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.geometry.devices import Intrinsics, project
-from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.processing import consistency
-from sl_nerfstudio.processing.consistency import _doubtful, adjust_consistent, without_groups
+from sl_nerfstudio.processing.consistency import adjust_consistent, without_groups
 from sl_nerfstudio.registration.assembly import Assembly
 from sl_nerfstudio.registration.register import include_left_out
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     Edge,
     NoCommonSurface,
-    PairsContradict,
     Registration,
     UncertainRotation,
     UndecidedProjector,
 )
 from sl_nerfstudio.registration.surfaces import frame_cloud
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of
-from sl_nerfstudio.review.agreement import CrossFrameAgreement, FrameCrossAgreement
 from tests.bundle_adjustment import analytic
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of
-from tests.registration.shaped_clouds import rendered, write_bar
 from tests.relative_pose.known_pose import known_pose
 
 SIZE, FRAMES, MOVED = 100, 7, 3
@@ -135,9 +130,9 @@ def test_frames_come_in_one_after_the_other(clouds, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("doubt", [{"by_order": True}, {"turns_deg": (90.0,)}, {}])
-@pytest.mark.parametrize("why", [PairsContradict(NAMES[MOVED], 9, 6), UndecidedProjector(NAMES[MOVED], 20.0)])
-def test_frames_that_fit_at_several_places_do_not_come_in(clouds, monkeypatch, doubt, why):
-    """Every frame of a symmetric object does; of others, those whose pairs contradict, or with two projectors."""
+def test_frames_that_fit_at_several_places_do_not_come_in(clouds, monkeypatch, doubt):
+    """Every frame of a symmetric object does; of others, those with two projectors."""
+    why = UndecidedProjector(NAMES[MOVED], 20.0)
     without = without_groups(registration_of(RIG.T_world_camera.numpy()), [[1], [MOVED]])
     torn = replace(without, exclusions=(without.exclusions[0], why), **doubt)
     asked = []
@@ -294,69 +289,3 @@ def test_groups_become_components_of_their_own_and_what_was_said_of_them_goes():
     for k in (1, 2, 4):
         assert np.isnan(found.T_world_camera[k]).all() and np.isnan(found.baseline[k]) and np.isnan(found.fitness[k])
     assert start.registered.all() and np.isfinite(start.T_world_camera).all()
-
-
-BAR_FRAMES, TURNED = 10, 4
-
-
-@pytest.mark.slow
-def test_a_frame_on_the_wrong_side_is_moved_to_where_it_agrees(tmp_path: Path) -> None:
-    """Two bosses on a bar differ by 10 of 90 mm.
-
-    A frame that is turned by half a turn agrees to 97 % with the others, as frames of real scans do; where it belongs,
-    to 100 %.
-    """
-    write_bar(tmp_path / "bar.ply")
-    made = rendered(str(tmp_path / "bar.ply"), tuple(range(BAR_FRAMES)), BAR_FRAMES, 130)
-    T = made.T_world_camera.copy()
-    T[TURNED] = np.diag([-1.0, -1.0, 1.0, 1.0]) @ T[TURNED]
-    names = tuple(cloud.name for cloud in made.clouds)
-    every, alone = np.full(BAR_FRAMES, True), np.zeros(BAR_FRAMES, dtype=np.int64)
-    start = Registration(names, T, made.baseline.copy(), every, alone, np.full(BAR_FRAMES, 0.95), (), (), ())
-    log: list[str] = []
-    found = adjust_consistent(made.clouds, start, log.append)
-    assert log == [f"tried at other places, where they may agree better: {names[TURNED]}"]
-    assert found.registration.registered.all()
-    poses = found.adjusted.poses.T_world_camera
-    turns = [a[:3, :3] @ b[:3, :3].T for a, b in zip(made.T_world_camera, poses, strict=True)]
-    assert max(angle_deg(turn @ turns[0].T) for turn in turns) < 0.3
-    assert min(frame.share for frame in found.cross.frames) > 0.99
-
-
-def agreement(share: float, excess: float) -> FrameCrossAgreement:
-    return FrameCrossAgreement(100, 1.0, share, 0.1, 0.3, excess)
-
-
-def test_doubtful_are_few_frames_that_agree_less_well_than_most() -> None:
-    def doubtful(*frames: FrameCrossAgreement) -> list[int]:
-        return _doubtful(CrossFrameAgreement(0.1, 0.97, 0.1, 0.3, frames, ()))
-
-    usual = [agreement(0.97, 1.1)] * 8
-    assert doubtful(*usual) == []
-    assert doubtful(*usual, agreement(0.94, 1.1), agreement(0.97, 1.5)) == [8, 9]
-    unknown = agreement(float("nan"), float("nan"))
-    assert doubtful(unknown, *usual, agreement(0.94, 1.1)) == [9]
-    assert doubtful(unknown, unknown) == []
-    worse = [agreement(0.97 - 0.03 - 0.01 * k, 1.1) for k in range(10)]
-    assert doubtful(*[agreement(0.97, 1.1)] * 30, *worse) == list(range(34, 40))  # the worst six
-    assert doubtful(agreement(0.97, 1.0), agreement(0.97, 1.0), agreement(0.5, 2.0), agreement(0.9, 1.0)) == [
-        2
-    ]  # a third at most
-
-
-@pytest.mark.slow
-def test_of_what_looks_the_same_from_several_sides_no_frame_is_moved(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The order of capture, not its surface, says where a frame of a nut is."""
-    rig = rig_of(9, 80)
-    clouds = clouds_of(rig, 80, noise=0.1)
-    T, baseline = rig.T_world_camera.numpy(), rig.T_camera_projector[:, :3, 3].norm(dim=-1).numpy()
-    names, n = tuple(cloud.name for cloud in clouds), len(clouds)
-    start = Registration(
-        names, T, baseline, np.full(n, True), np.zeros(n, dtype=np.int64), np.full(n, 0.95), (), (), ()
-    )
-    asked: list[bool] = []
-    monkeypatch.setattr(consistency._Adjuster, "with_moved", lambda _, group: asked.append(True) or group)
-    adjust_consistent(clouds, replace(start, turns_deg=(60.0,)), lambda _: None)
-    assert not asked
-    adjust_consistent(clouds, start, lambda _: None)
-    assert asked

@@ -4,9 +4,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity, exps_at
-from sl_nerfstudio.registration.assembly import Pivots
 from sl_nerfstudio.registration.evidence import Commonness
 from sl_nerfstudio.registration.pairs import PairMatch, Rival
+from sl_nerfstudio.registration.pose_graph import Pivots
 
 NO_SLIP = np.array([0.0, 0, 0, 0, 0, 1, 0])  # the direction of a slip: about the line of sight
 

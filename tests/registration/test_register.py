@@ -13,14 +13,12 @@ from sl_nerfstudio.bundle_adjustment.registered_frames import (
 )
 from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.processing.result import contradiction
 from sl_nerfstudio.registration import register as module
-from sl_nerfstudio.registration.pairs import LEAST_ODDS, Rival
-from sl_nerfstudio.registration.register import _doubtful, choose_projectors, chosen_clouds, register
+from sl_nerfstudio.registration.pairs import LEAST_ODDS
+from sl_nerfstudio.registration.register import choose_projectors, chosen_clouds, register
 from sl_nerfstudio.registration.result import (
     NoCommonSurface,
-    PairsContradict,
     PoorPair,
     Registration,
     SeparateComponent,
@@ -32,7 +30,6 @@ from sl_nerfstudio.relative_pose.candidates import plane_starts
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of, ray_pairs
 from tests.bundle_adjustment.analytic import DISK_HEIGHT, PROJECTORS, camera_of, images_of, rig_of
 from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of, pose_errors, rolled
-from tests.registration.graph_edges import edge
 from tests.registration.shaped_clouds import RenderedClouds, rendered
 from tests.relative_pose.known_pose import known_pose
 from tests.relative_pose.two_views import errors_deg
@@ -224,22 +221,6 @@ def test_a_frame_whose_surface_disagrees_says_how_much_agrees(few, monkeypatch):
     assert [(type(e), e.frame) for e in found.exclusions] == [(SurfaceDisagrees, name) for name in found.names]
     assert all(0.9 < e.fitness <= 1 for e in found.exclusions)
     assert np.isnan(found.T_world_camera).all() and np.isnan(found.baseline).all()
-
-
-def test_a_frame_most_of_whose_pairs_say_another_pose_is_left_out():
-    """Two of its pairs are used, and two that are a little more likely are not."""
-    nodes = [Similarity(1.0, T[:3, :3], T[:3, 3]) for T in RIG.T_world_camera[:5].numpy()]
-    ring = [edge(nodes, i, j) for i, j in ((0, 1), (1, 2), (0, 2), (0, 4), (1, 4), (2, 4))]
-    of_three = [edge(nodes, k, 3, log_odds=odds) for k, odds in ((0, 90.0), (1, 90.0), (2, 95.0), (4, 95.0))]
-    names, inside = tuple("abcde"), np.ones(5, dtype=bool)
-    used = np.array([True] * 6 + [True, True, False, False])
-    assert _doubtful(names, inside, ring + of_three, used) == {3: PairsContradict("d", 4, 2)}
-    used[-1] = True  # three of four agree
-    assert _doubtful(names, inside, ring + of_three, used) == {}
-    used[-1], rival = False, (Rival(nodes[0], -1.0),)
-    undecided = [replace(e, rivals=rival) if not u else e for e, u in zip(ring + of_three, used, strict=True)]
-    assert _doubtful(names, inside, undecided, used) == {}  # pairs with rivals say nothing
-    assert _doubtful(names, inside & (np.arange(5) != 4), ring + of_three, used) == {}
 
 
 def test_uncertainties_follow_their_limits(few, monkeypatch):

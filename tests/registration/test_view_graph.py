@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.registration import view_graph as module
-from sl_nerfstudio.registration.assembly import Pivots
 from sl_nerfstudio.registration.evidence import Commonness, Frame
-from sl_nerfstudio.registration.pairs import NEIGHBOURS, PairMatch, Rival
+from sl_nerfstudio.registration.pairs import LEAST_ODDS, NEIGHBOURS, PairMatch, Rival
+from sl_nerfstudio.registration.pose_graph import Pivots
 from sl_nerfstudio.registration.view_graph import (
     MOST_BY_ORDER,
     ViewGraph,
@@ -106,18 +106,30 @@ def turned(deg: float) -> Similarity:
     return pair(0, 1, deg).S_target_source
 
 
-def test_the_usual_step_is_that_of_pairs_that_hold(monkeypatch):
-    """The least turn that each allows: a nut is as likely turned by another 60 degrees."""
-    pairs = [pair(k, k + 1, 15.0 + k) for k in range(FRAMES - 1)]
-    pairs[3] = pair(3, 4, -42.0, rivals=(Rival(turned(18.0), -1.0), Rival(turned(2.0), -50.0)))
+def test_the_usual_step_is_that_which_makes_all_pairs_most_likely(monkeypatch):
+    """Not the least that each allows, as a tooth of a gear away."""
+    pairs = [pair(k, k + 1, 15.0 + k % 3) for k in range(FRAMES - 1)]
+    pairs[0] = pair(0, 1, -3.0, rivals=(Rival(turned(16.0), -1.0),))
     graph = graph_of(monkeypatch, pairs)
     assert graph.usual_step(0, 1, turned(40.0)) == 0.0  # not known yet
     graph.learn_step()
-    assert graph.step_deg == pytest.approx(17)
-    odds = [graph.usual_step(i, j, turned(17.0)) for i, j in ((0, 1), (1, 0), (0, 2), (0, 3))]
-    assert odds == pytest.approx([-0.5, -0.5, -0.125, 0.0])
-    assert graph.usual_step(0, 1, turned(77.0)) == pytest.approx(-0.5 * (77 / 17) ** 2)
+    assert graph.step is not None and graph.step.deg == pytest.approx(16, abs=1.5)
+    sigma = graph.step.sigma_deg
+    assert sigma == pytest.approx(0.3 * graph.step.deg)  # their spread is less
+    for i, j, deg in ((0, 1, 16.0), (1, 0, 3.0), (1, 2, 35.0)):
+        assert graph.usual_step(i, j, turned(deg)) == pytest.approx(-0.5 * ((deg - graph.step.deg) / sigma) ** 2)
+    assert graph.usual_step(0, 2, turned(2 * graph.step.deg)) == pytest.approx(0)
+    assert graph.usual_step(0, 3, turned(90.0)) == 0.0  # too far apart for the order to say anything
     assert graph.usual_step(0, 1, turned(170.0)) == -MOST_BY_ORDER  # someone may have walked to the other side
+
+
+def test_where_surfaces_decide_nothing_small_steps_are_likely(monkeypatch):
+    """A nut is as likely turned by another 60 degrees."""
+    pairs = [pair(k, k + 1, -42.0, rivals=(Rival(turned(18.0), 0.0),)) for k in range(FRAMES - 1)]
+    graph = graph_of(monkeypatch, pairs)
+    graph.learn_step()
+    assert graph.step is not None and graph.step.deg == pytest.approx(18, abs=2)
+    assert graph.usual_step(0, 1, turned(18.0)) > graph.usual_step(0, 1, turned(42.0)) + LEAST_ODDS
 
 
 def test_where_most_successive_frames_slip_the_order_says_nothing(monkeypatch):
@@ -125,7 +137,7 @@ def test_where_most_successive_frames_slip_the_order_says_nothing(monkeypatch):
     pairs = [pair(k, k + 1, slip=12.0 * (k > 1)) for k in range(FRAMES - 1)]
     graph = graph_of(monkeypatch, pairs)
     graph.learn_step()
-    assert graph.step_deg is None and graph.usual_step(0, 1, turned(170.0)) == 0.0
+    assert graph.step is None and graph.usual_step(0, 1, turned(170.0)) == 0.0
 
 
 # Rough camera poses as a start: baselines, and a common centre.

@@ -1,0 +1,124 @@
+"""Blocks of frames that fit as well, or better, elsewhere."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.registration.assembly import Prior, looks_alike
+from sl_nerfstudio.registration.blocks import BlockReview, Settled, Turn, best_block
+from sl_nerfstudio.registration.evidence import Comparison
+from sl_nerfstudio.registration.pairs import PairMatch, Rival
+from tests.registration.graph_edges import edge, pivots_of
+
+FRAMES, TURN = 12, 90.0
+
+
+def about_axis(degrees: float) -> Similarity:
+    """A turn of the world about the object's axis."""
+    return Similarity(1.0, Rotation.from_euler("y", degrees, degrees=True).as_matrix(), np.zeros(3))
+
+
+def camera(degrees: float) -> Similarity:
+    """Four units before the object, which it looks at."""
+    return about_axis(degrees) @ Similarity(1.0, np.eye(3), np.array([0.0, 0.0, 4.0]))
+
+
+NODES = [camera(30.0 * k) for k in range(FRAMES)]
+
+
+def pairs(odds_turned: float) -> list[PairMatch]:
+    """All pairs of near frames, each of which may be turned by a quarter, at some log-odds."""
+    found = []
+    for i in range(FRAMES):
+        for j in ((i + 1) % FRAMES, (i + 2) % FRAMES):
+            places = [NODES[j].inverse() @ about_axis(t) @ NODES[i] for t in (0, TURN, -TURN)]
+            rivals = tuple(Rival(S, odds_turned) for S in places[1:])
+            found.append(edge(NODES, i, j, rivals=rivals))
+    return found
+
+
+class Said:
+    """An assembly in which the pairs themselves say by how much one place leads another."""
+
+    def __init__(self, edges: list[PairMatch], prior: Prior | None) -> None:
+        self.edges, self.prior = edges, prior
+
+    def compare(self, first, second, places, alike: bool = False) -> Comparison:
+        odds = np.zeros(len(places))
+        for e in self.edges:
+            for moved, kept, own, other in ((e.source, e.target, second, first), (e.target, e.source, second, first)):
+                if moved in own and kept in other:
+                    S = [other[kept].inverse() @ T @ own[moved] for T in places]
+                    known = [e.log_odds_at(one if moved == e.source else one.inverse()) for one in S]
+                    odds += [-60.0 if one is None else one for one in known]
+        none = Comparison.none(len(places))
+        none.shared[:] = odds[:, None] - odds
+        return none
+
+    def usual(self, first, second, S) -> float:
+        if self.prior is None:
+            return 0.0
+        return sum(self.prior(i, j, first[i].inverse() @ S @ second[j]) for i in first for j in second)
+
+
+def review(edges: list[PairMatch], start: dict[int, Similarity], prior=None) -> Settled:
+    return BlockReview(Said(edges, prior), pivots_of(NODES), edges, start, prior).settled()
+
+
+def off_deg(nodes: dict[int, Similarity]) -> float:
+    """The largest rotation against the truth, to the first frame."""
+    first = min(nodes)
+    world = NODES[first] @ nodes[first].inverse()
+    return max(angle_deg((world @ S).R @ NODES[k].R.T) for k, S in nodes.items())
+
+
+@pytest.mark.parametrize("moved", [[4], [3, 4, 5], [0, 1, 2, 9, 10, 11]])
+def test_a_block_on_the_wrong_side_is_put_where_its_pairs_say(moved):
+    start = {k: about_axis(TURN) @ S if k in moved else S for k, S in enumerate(NODES)}
+    found = review(pairs(-30.0), start)
+    assert sorted(found.decided) == list(range(FRAMES)) and not found.open
+    assert off_deg(found.decided) < 0.1
+
+
+def test_what_no_pair_decides_is_taken_out_with_its_turn_and_its_odds():
+    """Frames 3, 4 and 5 show a side that is the same a quarter farther on."""
+    edges = [e for e in pairs(-40.0) if len({e.source, e.target} & {3, 4, 5}) != 1]
+    open_ = [e for e in pairs(-1.0) if len({e.source, e.target} & {3, 4, 5}) == 1]
+    found = review([*edges, *open_], dict(enumerate(NODES)))
+    assert sorted(found.decided) == [k for k in range(FRAMES) if k not in (3, 4, 5)]
+    (block,) = found.open
+    assert sorted(block.nodes) == [3, 4, 5] and block.turn_deg == pytest.approx(TURN, abs=0.1)
+    assert 0 <= block.log_odds < 10
+    assert off_deg({**found.decided, **block.nodes}) < 0.1 and not found.by_order
+
+
+def test_the_order_of_capture_keeps_what_surfaces_leave_open_and_that_is_said():
+    def prior(i: int, j: int, S: Similarity) -> float:
+        return -25.0 * float(abs(i - j) == 1 and abs(angle_deg(S.R) - 30) > 10)
+
+    found = review(pairs(0.0), dict(enumerate(NODES)), prior)
+    assert sorted(found.decided) == list(range(FRAMES)) and found.by_order
+    assert len(review(pairs(0.0), dict(enumerate(NODES))).decided) < FRAMES
+
+
+def test_a_quarter_that_a_pair_does_not_tell_is_one_after_which_the_object_looks_alike():
+    nodes = dict(enumerate(NODES))
+    for odds, alike in ((-2.0, True), (-30.0, False)):
+        assert looks_alike(pairs(odds), nodes, about_axis(TURN)) is alike
+    assert not looks_alike(pairs(-2.0), nodes, about_axis(45.0))
+    assert not looks_alike(pairs(-2.0), {}, about_axis(TURN))
+
+
+@settings(max_examples=40)
+@given(st.integers(2, 7), st.integers(0, 10**6))
+def test_a_block_gains_what_is_said_and_at_least_as_much_as_any_single_frame(n, seed):
+    gain = np.random.default_rng(seed).normal(size=(n, n))
+    np.fill_diagonal(gain, 0)
+    cut = best_block(gain, Turn(Similarity.identity(), False, gain, gain))
+    assert 0 < cut.block.sum() < n
+    assert cut.gain == pytest.approx(gain[np.ix_(cut.block, ~cut.block)].sum())
+    single = max(gain[k].sum() for k in range(n))
+    assert cut.gain >= single - 1e-9
