@@ -190,8 +190,8 @@ class PairMatch:
 
 
 def is_accepted(match: PairMatch) -> bool:
-    """Whether two frames have a surface in common, wherever it is."""
-    return match.log_odds > LEAST_ODDS
+    """Whether two frames have a surface in common, wherever it is: what slips fits as well along its whole motion."""
+    return match.log_odds > (0.0 if match.slip_deg else LEAST_ODDS)
 
 
 def is_ambiguous(match: PairMatch) -> bool:

@@ -55,7 +55,7 @@ LEAST_STEP_DEG = 2.0  # of successive frames
 STEPS_DEG = np.geomspace(1.0, 60.0, 60)  # that are compared
 UNUSUAL_DENSITY = 1e-3  # of a turn that is not the usual one, per degree
 LEAST_SPREAD = 0.3  # of the usual step, relative to it
-LARGEST_GAP = 2  # between frames of which the order of capture says something
+LARGEST_GAP = 2  # between frames by which the usual step is learnt
 MOST_BY_ORDER = 25.0  # nats against a place by the order: someone may have walked to the other side
 LEAST_DISTANCE = 0.2  # of a camera from the object, relative to the median, for its rough pose to be used
 
@@ -282,10 +282,9 @@ class ViewGraph:
 
     def usual_step(self, i: int, j: int, S_i_j: Similarity) -> float:
         """Log-odds of the place of one frame on another by the order of capture."""
-        gap = abs(i - j)
-        if self.step is None or gap > LARGEST_GAP:
+        if self.step is None or abs(i - j) > 1:
             return 0.0
-        off = (angle_deg(S_i_j.R) / gap - self.step.deg) / self.step.sigma_deg
+        off = (angle_deg(S_i_j.R) - self.step.deg) / self.step.sigma_deg
         return -min(0.5 * off**2, MOST_BY_ORDER)
 
     def solve(self, component: Component) -> PoseGraphSolution:
