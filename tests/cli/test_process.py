@@ -16,7 +16,7 @@ from sl_nerfstudio.scan import Scale, check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png, read_image
 from tests.processing.gray_scan import make_gray_scan
 
-from .snapshots import call, expect, expect_refusals, masked, succeed
+from .snapshots import expect, expect_refusals, masked, succeed
 
 pytestmark = pytest.mark.slow
 
@@ -103,18 +103,6 @@ def test_frames_that_cannot_be_used_are_left_out_by_name(copy, tmp_path):
     assert [f["in_scan"] for f in document["frames"]] == [False, True, True, False]
     manifest = json.loads((tmp_path / "w" / "manifest.json").read_text())["frames"]
     assert manifest["pose 0"]["status"] == "failed in decoding" and manifest["pose 1"]["status"] == "decoded"
-
-
-def test_fewer_than_two_frames_is_an_error_that_names_them_all(copy, tmp_path):
-    for k in range(3):
-        _spoil(copy.root / "images" / f"pose {k}", np.zeros_like)
-    out = tmp_path / "scan"
-    said = call(main, "sl-process", *copy.flags, "--output", out, "--work", tmp_path / "w", "--jobs", 1).err
-    assert "1 of 4 frames can be used, a scan needs at least 2" in said
-    for k in range(3):
-        assert f"pose {k}: " in said
-    assert "cause:" in said and "remedy:" in said
-    assert not out.exists() and (tmp_path / "w" / "processing.html").is_file()
 
 
 def test_colour_16_bit_and_a_camera_held_upside_down(copy, tmp_path):

@@ -122,13 +122,6 @@ def test_a_number_alone_is_refused_once_frames_were_removed(sphere, number):
     assert f"names frame number {number}" in fault.problem and "removed" in fault.cause
 
 
-def test_an_old_scan_that_lost_the_frame_with_the_known_baseline_says_so(sphere):
-    edit(sphere, with_scale({"known": True, "source": f"baseline of frame 1 ({NAMES[1]})"}))
-    edit(sphere, remove(NAMES[1]))
-    fault = only_fault(sphere)
-    assert (fault.field, fault.problem) == ("scale.baseline_of", f"names frame {NAMES[1]!r}, which is not in the scan")
-
-
 def test_a_sentence_is_not_read_where_data_say_otherwise_or_nothing_is_known(sphere):
     edit(sphere, with_scale({"known": True, "source": "baseline of frame 1", "baseline_of": NAMES[0]}))
     assert read_scan(sphere).scale.baseline_of == NAMES[0]
