@@ -46,7 +46,7 @@ _DAMAGE = (OSError, SyntaxError, ValueError, EOFError, TypeError, LookupError, O
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What the header of an image file says; `mode` is "grey" or "RGB"."""
+    """Header of an image file; `mode` is "grey" or "RGB"."""
 
     w: int
     h: int

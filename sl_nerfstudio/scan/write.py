@@ -198,7 +198,7 @@ class ScanWriter:
         self._write("transforms.json", document, last=self.root == self._folder.root)
 
     def _settle_intrinsics(self) -> None:
-        """If one frame has its own camera, give every frame its own: programs differ in which value they use."""
+        """Give every frame its own camera if one has: programs differ in which value they use."""
         if self._camera is None or not any("fl_x" in frame for frame in self._frames):
             return
         common = device_fields(self._camera, "camera_model")
@@ -338,7 +338,7 @@ def read_poses(path: Path, scan: Scan) -> DevicePoses:
 
 
 def read_ground_truth(scan: Scan) -> GroundTruth:
-    """What the scan's ground_truth/ holds: mesh.ply, and poses if transforms.json has both kinds.
+    """Read the scan's ground_truth/: mesh.ply, and poses if transforms.json has both kinds.
 
     Raises ScanError for faulty poses, as `read_poses` does.
     """
