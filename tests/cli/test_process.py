@@ -9,11 +9,12 @@ import pytest
 import torch
 
 from sl_nerfstudio.cli.process import main
-from sl_nerfstudio.geometry.lie import exp_se3, fit_similarity
+from sl_nerfstudio.geometry.lie import exp_se3
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan import Scale, check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png, read_image
+from tests.formulas import pose_errors
 from tests.processing.gray_scan import make_gray_scan
 
 from .snapshots import expect, expect_refusals, masked, succeed
@@ -77,13 +78,10 @@ def _assert_poses(scan, captures):
     """All devices lie as they truly do after one rigid motion: the length is known."""
     found = np.concatenate([scan.poses.T_world_camera, scan.poses.T_world_projector])
     true = np.concatenate([captures.T_world_camera, captures.T_world_projector])
-    S = fit_similarity(found[:, :3, 3], true[:, :3, 3])
+    S, degrees, off = pose_errors(found, true)
     assert S.scale == pytest.approx(1, abs=0.03)
     span = np.linalg.norm(np.ptp(true[:, :3, 3], axis=0))
-    assert np.linalg.norm(S.points(found[:, :3, 3]) - true[:, :3, 3], axis=1).max() < 0.03 * span
-    turned = np.einsum("nij,nkj->nik", S.R @ found[:, :3, :3], true[:, :3, :3])
-    angle = np.degrees(np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    assert angle.max() < 2.0
+    assert off.max() < 0.03 * span and degrees.max() < 2.0
 
 
 def test_frames_that_cannot_be_used_are_left_out_by_name(copy, tmp_path):

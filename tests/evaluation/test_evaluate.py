@@ -28,6 +28,7 @@ from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 from sl_nerfstudio.meshing.uncertainty import point_changes, views_by_frame
 from sl_nerfstudio.scan import Scan, read_scan
+from tests import formulas
 
 from .faceted_scan import FacetedScan
 from .shapes import blob, known_similarity, sphere, turn
@@ -255,7 +256,7 @@ def quality() -> VertexQuality:
 
 def test_a_point_is_where_the_rays_of_all_its_pixels_meet_best(scan, rows):
     """With disturbed poses, least squares on the plain pinhole formulas, from the pixels under the true ones."""
-    from .faceted_scan import CAMERA, PROJECTOR, project_plainly
+    from .faceted_scan import CAMERA, PROJECTOR
 
     chosen, found, seen = rows
     row = int(seen.sum(1).argmax())
@@ -269,7 +270,7 @@ def test_a_point_is_where_the_rays_of_all_its_pixels_meet_best(scan, rows):
             camera = delta[k] @ scan.poses.T_world_camera[k]
             light = camera @ rho[k] @ scan.poses.T_camera_projector[k]
             for device, T in ((CAMERA, camera), (PROJECTOR, light)):
-                out.append(project_plainly(device, ((at - T[:3, 3]) @ T[:3, :3])[None])[0])
+                out.append(formulas.pixels(device, T, at))
         return np.concatenate(out)
 
     decoded, ends = pixels(p, 0.0), []

@@ -20,6 +20,7 @@ from sl_nerfstudio.synthesis.devices import (
     pose_sigma,
 )
 from sl_nerfstudio.synthesis.scenes import cone_and_cylinder
+from tests.formulas import pixels
 
 _OBJECT = cone_and_cylinder()
 
@@ -116,13 +117,8 @@ def rig(scene, truth):
     p = scene.centre + rng.uniform(-1, 1, (150, 3)) * np.ptp(scene.vertices, axis=0) / 2
     pairs = zip(truth.T_world_camera, truth.T_world_projector, strict=True)
     return devices, [
-        ExactMatches(_pixel(devices.camera, T_c, p), _pixel(devices.projector, T_p, p), p) for T_c, T_p in pairs
+        ExactMatches(pixels(devices.camera, T_c, p), pixels(devices.projector, T_p, p), p) for T_c, T_p in pairs
     ]
-
-
-def _pixel(device, T, p):
-    q = (p - T[:3, 3]) @ T[:3, :3]
-    return np.stack([device.cx - device.fl_x * q[:, 0] / q[:, 2], device.cy + device.fl_y * q[:, 1] / q[:, 2]], 1)
 
 
 def _start(truth, scene, rig, noise, seed=0):
