@@ -334,8 +334,7 @@ def test_one_frame_that_sees_through_an_invented_patch_outweighs_two_that_decode
         if number == 1:
             return coords
         row, column = np.mgrid[: CAMERA.h, : CAMERA.w] + 0.5
-        x, y, z = np.linalg.solve(poses[number][0], [*(RADIUS * towards), 1.0])[:3]
-        u, v = CAMERA.cx - CAMERA.fl_x * x / z, CAMERA.cy + CAMERA.fl_y * y / z
+        u, v = pixels(CAMERA, poses[number][0], RADIUS * towards)
         return np.where((np.hypot(column - u, row - v) < 7)[..., None], np.float32(np.nan), coords)
 
     result = trim_to_observed(bulged, scan_of(truth, poses, tmp_path / "scan", undecoded))
@@ -350,31 +349,36 @@ def cells(number: int, share: float, across: int = 16, size: int = 6) -> np.ndar
     return np.kron(chosen, np.ones((size, size), dtype=bool))
 
 
+FINE = CAMERA.scaled(2.0)
+
+
+@pytest.fixture(scope="module")
+def faces_observed(truth, tmp_path_factory) -> dict[int, int]:
+    """Triangles that stay where one frame and where all of them decode everything."""
+    root = tmp_path_factory.mktemp("fine")
+    scans = {n: scan_of(truth, RING[:n], root / str(n), camera=FINE) for n in (1, len(RING))}
+    return {n: len(trim_to_observed(truth, scan).mesh.faces) for n, scan in scans.items()}
+
+
 @pytest.mark.parametrize("share", [0.15, 0.5])
-def test_undecoded_cells_inside_the_mask_make_no_hole(truth, tmp_path, share):
-    camera = CAMERA.scaled(2.0)
-    whole = trim_to_observed(truth, scan_of(truth, RING, tmp_path / "a", camera=camera)).mesh
+def test_undecoded_cells_inside_the_mask_make_no_hole(truth, faces_observed, tmp_path, share):
     blank = np.float32(np.nan)
     ball_scan = scan_of(
-        truth, RING, tmp_path / "b", lambda i, c: np.where(cells(i, share, 32)[..., None], blank, c), camera
+        truth, RING, tmp_path / "scan", lambda i, c: np.where(cells(i, share, 32)[..., None], blank, c), FINE
     )
     holey = trim_to_observed(truth, ball_scan).mesh
     assert euler(holey) == 1
-    assert len(holey.faces) == pytest.approx(len(whole.faces), rel=0.05)  # cells at the border are no gaps
+    assert len(holey.faces) == pytest.approx(faces_observed[len(RING)], rel=0.05)  # cells at the border are no gaps
 
 
 @pytest.mark.parametrize("frames", [1, 6])
-def test_wrongly_decoded_cells_make_no_hole(truth, tmp_path, frames):
+def test_wrongly_decoded_cells_make_no_hole(truth, faces_observed, tmp_path, frames):
     """3 % wrong cells, off by 60 px; with one frame nothing else confirms the surface there."""
-    camera, poses = CAMERA.scaled(2.0), RING[:frames]
-    wrong = scan_of(
-        truth, poses, tmp_path / "a", lambda i, c: c + np.float32(60) * cells(i, 0.03, 96, 2)[..., None], camera
-    )
+    root, off = tmp_path / "scan", np.float32(60)
+    wrong = scan_of(truth, RING[:frames], root, lambda i, c: c + off * cells(i, 0.03, 96, 2)[..., None], FINE)
     result = trim_to_observed(truth, wrong)
     assert euler(result.mesh) == 1
-    assert len(result.mesh.faces) == pytest.approx(
-        len(trim_to_observed(truth, scan_of(truth, poses, tmp_path / "b", None, camera)).mesh.faces), rel=0.02
-    )
+    assert len(result.mesh.faces) == pytest.approx(faces_observed[frames], rel=0.02)
     assert frames > 1 or result.closed > 0
 
 
