@@ -143,31 +143,6 @@ def test_code_files_named_in_the_text_exist(page):
         assert any(f"/{file}".endswith(f"/{name}") for file in files), f"no file {name}"
 
 
-def layout_of_the_package() -> list[str]:
-    """What CONTRIBUTING's layout lists directly below the package, in its order."""
-    text = (ROOT / "CONTRIBUTING.md").read_text()
-    block = text[text.index("    sl_nerfstudio/\n") : text.index("    tests/ ")]
-    return re.findall(r"^ {6}(\w+(?:/|\.py)) ", block, re.MULTILINE)
-
-
-def test_contributing_lists_every_folder_and_file_of_the_package():
-    package = ROOT / "sl_nerfstudio"
-    folders = {f"{path.parent.name}/" for path in package.glob("*/__init__.py")}
-    files = {path.name for path in package.glob("*.py")} - {"__init__.py"}
-    listed = layout_of_the_package()
-    assert len(listed) == len(set(listed))
-    assert set(listed) == folders | files
-
-
-def test_contributing_lists_folders_in_the_order_of_their_imports():
-    listed = [name.removesuffix("/").removesuffix(".py") for name in layout_of_the_package()]
-    for path in (ROOT / "sl_nerfstudio").rglob("*.py"):
-        own = path.relative_to(ROOT / "sl_nerfstudio").with_suffix("").parts[0]
-        for other in re.findall(r"^\s*(?:from|import) sl_nerfstudio\.(\w+)", path.read_text(), re.MULTILINE):
-            in_order = own == "__init__" or listed.index(other) <= listed.index(own)
-            assert in_order, f"{path}: {other} is listed after {own}"
-
-
 @pages
 def test_link_targets_exist(page):
     for target in LINK.findall(page.read_text()):

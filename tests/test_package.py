@@ -6,10 +6,11 @@ import importlib
 import importlib.metadata
 import re
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.test_layout import IMPORTS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -28,23 +29,6 @@ IMPORTED_AS = {
 }  # fmt: skip
 # Declared without being imported here, each with the reason.
 NOT_IMPORTED: dict[str, str] = {}
-
-
-def modules() -> list[Path]:
-    return sorted(PACKAGE.rglob("*.py"))
-
-
-def imports(path: Path) -> Iterator[str]:
-    """Absolute names of all modules that a file imports, anywhere in it."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            yield from (name.name for name in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            if node.level:
-                package = path.relative_to(ROOT).with_suffix("").parts[: -node.level]
-                yield ".".join((*package, *filter(None, [node.module])))
-            elif node.module:
-                yield node.module
 
 
 def distribution_name(requirement: str) -> str:
@@ -86,7 +70,7 @@ def test_exactly_one_opencv():
 
 def test_imported_packages_are_the_declared_dependencies():
     standard = sys.stdlib_module_names | {"sl_nerfstudio"}
-    imported = {name.split(".")[0] for path in modules() for name in imports(path)} - standard
+    imported = {name.split(".")[0] for names in IMPORTS.values() for name in names} - standard
     extras = [text for name, texts in PROJECT["optional-dependencies"].items()
               if name not in ("dev", "docs") for text in texts]  # fmt: skip
     declared = {distribution_name(text) for text in PROJECT["dependencies"] + extras} - NOT_IMPORTED.keys()

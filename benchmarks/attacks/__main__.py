@@ -5,7 +5,7 @@
 `--groups` takes parts of the names of groups or cases; `--keep` keeps the folders of the cases that went wrong. A case
 is right if the command refused with a message that names the cause, or succeeded with the right result. It is wrong if
 it crashed, hung, printed a traceback, or ended with status 0 and a wrong result. What tests/ states of single runs
-(folders of trainings, interrupted trainings, scans and runs that do not belong together, the viewer) is not repeated.
+(wrong scans, intrinsics and meshes, folders of trainings, interrupted trainings, the viewer) is not repeated.
 """
 
 import os

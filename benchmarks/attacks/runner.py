@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 
-from benchmarks.attacks import bad_files, flags, foreign_runs, kills, wrong_scans
+from benchmarks.attacks import flags, foreign_runs, kills
 from benchmarks.attacks.commands import Case, preload
 
-GROUPS = (flags.cases, bad_files.cases, wrong_scans.cases, foreign_runs.cases, kills.cases)
+GROUPS = (flags.cases, foreign_runs.cases, kills.cases)
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ Track = Callable[[Sequence[int], str], Iterable[int]]
 
 @dataclass(frozen=True)
 class ModelScore:
-    """How well one model of a device predicts left-out views."""
+    """Score of a device's model on left-out views."""
 
     device: int  # 0: camera, 1: projector
     model: FreeIntrinsics
@@ -229,7 +229,7 @@ class RadialMisfit:
 
 
 def radial_misfit(device: Device, seen: CornerSightings, residual: Float64[ndarray, "n 2"]) -> RadialMisfit | None:
-    """What is left along the radius of a wide lens, in rings; None where it is chance, or below the noise.
+    """Residual of a wide lens along its radius, in rings; None where it is chance, or below the noise.
 
     `residual` is seen minus predicted. Corners of a view share errors, so a ring is as certain as its views agree.
     """
@@ -265,7 +265,7 @@ _LEAST_SEEN = 0.5  # of the corners of a suggested board that must be in both de
 
 @dataclass(frozen=True)
 class Coverage:
-    """How varied the views are."""
+    """Variety of the views."""
 
     tilt_deg: float  # largest angle between two boards
     depth_ratio: float  # distance of the farthest board over that of the nearest
@@ -286,7 +286,7 @@ class NextPose:
 
 
 def coverage_of(adjusted: AdjustedBoard, views: Sequence[BoardView]) -> Coverage:
-    """How varied the views are."""
+    """Variety of the views."""
     rig = adjusted.rig
     normals, distance = rig.T_camera_board[:, :3, 2], np.linalg.norm(rig.T_camera_board[:, :3, 3], axis=1)
     tilt = np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min()))
@@ -394,7 +394,7 @@ class BoardCalibration:
 
     @property
     def free(self) -> tuple[FreeIntrinsics, ...]:
-        """What was fitted of each device."""
+        """The fitted intrinsics of each device."""
         return self.adjusted.free
 
 

@@ -165,7 +165,7 @@ def _mean(paths: Sequence[Path]) -> Float32[ndarray, "h w"]:
 
 
 def _edges(grey: Float32[ndarray, "h w"]) -> float:
-    """How much an image changes from pixel to pixel, relative to its contrast: lines of a grid add to it."""
+    """Mean change from pixel to pixel, relative to the image's contrast; lines of a grid add to it."""
     change = np.abs(np.diff(grey, axis=0)).mean() + np.abs(np.diff(grey, axis=1)).mean()
     return float(change / max(float(grey.std()), 1e-6))
 
@@ -276,7 +276,7 @@ def _charuco_corners(grey: UInt8[ndarray, "h w"], board: CharucoBoard, legacy: b
 
 
 def without_reflectance(pattern: Float32[ndarray, "h w"], plain: Float32[ndarray, "h w"]) -> UInt16[ndarray, "h w"]:
-    """What the board would look like under the pattern if it were white all over. Images are from 0 to 1.
+    """The board under the pattern as if it were white all over. Images are from 0 to 1.
 
     Black squares then show the pattern as white ones do, and no edge of the board moves what is decoded beside it:
     corners in the pattern become three to ten times as accurate. Room light may be in either photograph, or in both;
@@ -321,7 +321,7 @@ def _carried(
 
 
 def _at_origin(xy: Float64[ndarray, "n 2"], uv: Float64[ndarray, "n 2"]) -> Float64[ndarray, "2"] | None:
-    """Where a robustly fitted homography from `xy` to `uv` puts (0, 0); None where there is none."""
+    """Map (0, 0) by a robustly fitted homography from `xy` to `uv`; None if none fits."""
     middle = np.median(uv, axis=0)
     size = max(float(np.abs(uv - middle).max()), 1e-6)
     target = (uv - middle) / size

@@ -409,7 +409,7 @@ def read_device_file(
 
 
 def chosen_entry(path: Path, role: Role, size: tuple[int, int], procam_step: int = 1, name: str = "") -> DeviceEntry:
-    """What the file says of a device, as it stands there; arguments and errors are those of `read_device_file`."""
+    """Read a device's entry as it stands in the file; arguments and errors are those of `read_device_file`."""
     entries = [entry for entry in read_entries(path, procam_step) if name in ("", entry.label)]
     return _choose(path, entries, role, size)
 

@@ -1,4 +1,4 @@
-"""What is stated of the intrinsics: their uncertainty in a file, and what the camera wrote into its photographs."""
+"""Stated intrinsics: their uncertainty in a file, and the focal length that a camera wrote into its photographs."""
 
 import math
 from collections.abc import Sequence
@@ -49,7 +49,7 @@ class StatedSigma:
 def read_stated_sigma(
     path: Path | None, role: Role, size: tuple[int, int], procam_step: int = 1, name: str = ""
 ) -> Shares:
-    """What a file states of a device that `read_device_file` reads; `CERTAIN` if it states nothing, or for no file."""
+    """Read the uncertainty that a file states for a device; `CERTAIN` if it states none, or for no file."""
     if path is None:
         return CERTAIN
     entry = chosen_entry(path, role, size, procam_step, name)

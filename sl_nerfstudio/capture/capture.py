@@ -119,7 +119,7 @@ _THUMBNAIL = 300  # width, pixels
 
 @dataclass
 class SequenceProgress:
-    """What the frames so far have seen of the pattern, and the last of them."""
+    """Coverage of the pattern by the frames so far, and the last of them."""
 
     times_seen: Int[ndarray, "rows columns"]
     frames: int = 0

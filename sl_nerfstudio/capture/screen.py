@@ -24,7 +24,7 @@ _LONGEST_WAIT = 0.1  # seconds; control-C is noticed in between
 
 
 class Key(Enum):
-    """What a pressed key means."""
+    """Meaning of a pressed key."""
 
     NEXT = "next"  # space, return, right, page down
     BACK = "back"  # left, page up

@@ -1,4 +1,4 @@
-"""Which images are kept: sharp and well exposed ones that show the pattern elsewhere than those kept before."""
+"""Selection of images: sharp and well exposed ones that show the pattern elsewhere than those kept before."""
 
 from dataclasses import dataclass, field
 from enum import Enum
@@ -132,7 +132,7 @@ class PlainReader:
 
 
 class SelectionVerdict(Enum):
-    """What is said of an image."""
+    """Verdict on an image."""
 
     KEEP = "keep"
     NO_PATTERN = "no pattern"  # not enough of it
@@ -146,7 +146,7 @@ class SelectionVerdict(Enum):
 
 @dataclass(frozen=True)
 class SelectionLimits:
-    """From when on an image is kept."""
+    """Thresholds for keeping an image."""
 
     # Of the places that show the pattern.
     least_nodes: int = 48  # four times what decoding needs
@@ -207,5 +207,5 @@ class Selection:
 
     @property
     def times_seen(self) -> Int[ndarray, "rows columns"]:
-        """In how many kept views each node of the pattern was found."""
+        """Number of kept views in which each node of the pattern was found."""
         return np.sum([np.zeros(self.shape, dtype=np.int64), *(view.seen for view in self.kept)], axis=0)

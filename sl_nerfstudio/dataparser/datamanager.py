@@ -268,7 +268,7 @@ class SLDataManager(VanillaDataManager[SLDataset]):
         return self._rays_and_batch(self.eval_pixel_sampler.sample(step))
 
     def held_out_batch(self, frame: int, count: int) -> tuple[RayBundle, Batch]:
-        """At most `count` of one frame's held-out pixels, evenly spread; possibly none."""
+        """Return up to `count` of one frame's held-out pixels, evenly spread; possibly none."""
         index = self._samples.held_out_of(frame)
         if len(index) > count:
             index = index[torch.from_numpy(evenly_spaced(len(index), count)).to(index.device)]

@@ -137,7 +137,7 @@ class PixelBatch:
     held_out: Bool[Tensor, "n"]  # never used for training
 
     def to(self, device: torch.device | str) -> "PixelBatch":
-        """The same pixels on another device."""
+        """Copy the pixels to another device."""
         return PixelBatch(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
     @property
@@ -205,7 +205,7 @@ class PixelSamples:
         return sum(int(part.isfinite().sum()) for part in self.coords[:, 0].split(_AT_ONCE)) / len(self)
 
     def _announce(self, reading: Callable[[int, int], None]) -> None:
-        """How the records will be read next, which matters if they are in a file."""
+        """Tell the system how the records will be read next; this matters if they are in a file."""
         if self.in_file:
             reading(self.records.data_ptr(), self.records.nbytes)
 
@@ -215,7 +215,7 @@ class PixelSamples:
         return self.records.device
 
     def to(self, device: torch.device | str) -> "PixelSamples":
-        """The same table on another device."""
+        """Copy the table to another device."""
         if torch.device(device) == self.device:
             return self
         return PixelSamples(self.records.to(device), self.first.to(device), self.held_out_index.to(device))
@@ -315,7 +315,7 @@ def _frame_pixels(number: int, frame: Frame) -> Shaped[ndarray, "n"]:
 
 
 def _hold_one_block_out(scan: Scan, records: Shaped[ndarray, "n"]) -> Int64[ndarray, "m"]:
-    """For scans so small that the hash holds nothing out: the occupied block with the smallest hash."""
+    """Hold out the occupied block with the smallest hash, in scans so small that the hash alone holds nothing out."""
     value = np.empty(len(records))
     for number, frame in enumerate(scan.frames):
         own = records["frame"] == number
@@ -449,7 +449,7 @@ class LoadedScan:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Which scan it is, wherever its folder lies; see fingerprint.py."""
+        """Identity of the scan, independent of its folder; see fingerprint.py."""
         return scan_fingerprint(self.scan)
 
 

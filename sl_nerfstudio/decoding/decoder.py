@@ -1,4 +1,4 @@
-"""What a decoder is: from the image files of one frame to pattern coordinates."""
+"""The interface of decoders: from the image files of one frame to pattern coordinates."""
 
 import hashlib
 from abc import ABC, abstractmethod
@@ -154,7 +154,7 @@ class Decoder(ABC, Generic[L]):
     sequence: ClassVar[bool]  # a frame is a folder of images, not a single image
 
     def __init__(self, layout: L, order_stated: bool = False) -> None:
-        """With `order_stated` the user named the order of the images: what speaks against it is a note, no error."""
+        """Create a decoder; with `order_stated`, evidence against the stated order of images is a note, no error."""
         self.layout, self.order_stated = layout, order_stated
 
     @abstractmethod

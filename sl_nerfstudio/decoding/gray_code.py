@@ -178,7 +178,7 @@ Grey = Float32[ndarray, "h w"]
 
 @dataclass(frozen=True)
 class Sine:
-    """What the photographs of a shifted sine say of every pixel."""
+    """Phase, amplitude and mean of a shifted sine at every pixel."""
 
     phase: Float32[ndarray, "h w"]  # radians, 0 to 2 pi
     amplitude: Float32[ndarray, "h w"]  # of full scale; half of the direct light
@@ -234,7 +234,7 @@ class Photographs:
         return MAD_TO_SIGMA / spread * float(np.median(np.abs(means)))
 
     def _noise_of_one_bit(self, place: int) -> float:
-        """From a coarse bit against white or black, whichever is nearer, less the mean of its four neighbours.
+        """Noise of a coarse bit against white or black, whichever is nearer, less the mean of its four neighbours.
 
         That difference is smooth: it holds nothing of the object's texture, and global light varies slowly.
         """
@@ -334,7 +334,7 @@ def phase_coordinates(
 
 
 def _border_bit(cells: CodeCells, first: Int32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
-    """How certain the bit is that changes between cell `first` and the next one; the largest value past the last."""
+    """Certainty of the bit that changes between cell `first` and the next one; the largest value past the last."""
     bits = len(cells.difference)
     flipped = gray(np.maximum(first, 0)) ^ gray(np.maximum(first, 0) + 1)
     bit = np.rint(np.log2(flipped)).astype(np.int64)
@@ -441,7 +441,7 @@ def separate(photographs: Photographs) -> SequenceLight:
 
 
 def _notes(layout: GrayCode, light: SequenceLight, finest: Sequence[int]) -> Iterator[str]:
-    """What limits the coordinates: stripes that are too fine for what is seen of them, and saturated pixels."""
+    """Describe what limits the coordinates: stripes too fine to be resolved, and saturated pixels."""
     shown = [layout.cell << layout.bits[axis] - max(len(layout.bit_images(axis)), 1) for axis in (0, 1)]
     if any(size > least for size, least in zip(finest, shown, strict=True)):
         x, y = finest
@@ -541,7 +541,7 @@ def _read_cells(photographs: Photographs, axis: int, light: SequenceLight) -> Co
 
 
 def _uncertain(p: Float32[ndarray, "h w"], q: Float32[ndarray, "h w"], light: SequenceLight) -> Bool[ndarray, "h w"]:
-    """Where image `p` and its inverse `q` do not decide a bit.
+    """Find pixels where image `p` and its inverse `q` do not decide a bit.
 
     Their difference is plus or minus the direct light, plus a share of the global light between -1 and 1. Its sign is
     certain if it is larger than what global light alone could cause with the wrong sign.

@@ -1,4 +1,4 @@
-"""Which sequence a folder of photographs shows, where no pattern file says so."""
+"""Recognition of the sequence that a folder of photographs shows, where no pattern file states it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -53,7 +53,7 @@ class Misplaced:
 
 @dataclass(frozen=True)
 class OrderCheck:
-    """How photographs fit the order of a sequence."""
+    """Agreement of photographs with the order of a sequence."""
 
     misplaced: tuple[Misplaced, ...]
     turning: float | None  # share of samples where the pattern's axes turn as the camera's; None: cannot be judged
@@ -136,7 +136,7 @@ def _bits(
 def _resolved_bits(
     images: Float32[ndarray, "n *at"], layout: GrayCode, axis: int
 ) -> tuple[list[Bool[ndarray, "*at"]], list[Bool[ndarray, "*at"]]]:
-    """The same without the finest bits that are uncertain for half of the lit pixels or more; at least one bit."""
+    """Drop the finest bits that are uncertain for half of the lit pixels or more; keep at least one bit."""
     signs, certain = _bits(images, layout, axis)
     lit = _lit(images).sum()
     count = next((k for k, sure in enumerate(certain) if sure.sum() < lit / 2), len(certain))
@@ -351,7 +351,7 @@ def _with_periods(layouts: Sequence[GrayCode], samples: Samples) -> list[GrayCod
 
 
 def _periods(layout: GrayCode, grid: Float32[ndarray, "n h w"], axis: int) -> int | None:
-    """How many periods the shorter sine of an axis has in the longer one; None if they do not belong together."""
+    """Number of periods of an axis's shorter sine in the longer one; None if they do not belong together."""
     contrast = grid.max(0) - grid.min(0)
     lit = contrast > 0.5 * np.percentile(contrast, 95)
     long, short = (sine_phase(grid, layout, axis, which) for which in (0, 1))

@@ -151,7 +151,7 @@ class NetworkDecoder(Decoder[GridPattern]):
         return self.decode_image(read_photograph(paths[0]))
 
     def decode_image(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
-        """The same for an image that was read, or computed."""
+        """Decode an image that was read or computed; otherwise like `decode`."""
         return self.images.decode(image)
 
     def weights(self) -> Iterable[Path]:
@@ -160,5 +160,5 @@ class NetworkDecoder(Decoder[GridPattern]):
 
     @cached_property
     def images(self) -> GridImageDecoder:
-        """What decodes single images."""
+        """The decoder of single images."""
         return GridImageDecoder(self.layout)

@@ -78,7 +78,7 @@ class NodeRecogniser:
         return Assignment(turn, agree(place, graph, codes))
 
     def logits(self, graph: GridGraph) -> Float[Tensor, "n m"]:
-        """How similar each node is to each node of the pattern in its four quarter turns.
+        """Similarity of each node to each node of the pattern in its four quarter turns.
 
         Candidates are in the order of `turned_pattern`.
         """
@@ -345,7 +345,7 @@ def _overtone(contrast: Float[ndarray, "n"], x: Float[ndarray, "n"], y: Float[nd
 
 @lru_cache(maxsize=4)
 def _drawn_overtones(pattern: GridPattern) -> tuple[float | None, ...]:
-    """The same for the pattern as drawn with each of the blurs, at the scale of a rectified image."""
+    """Overtones of the drawn pattern with each of the blurs, at the scale of a rectified image."""
     scale = RECTIFIED_PERIOD / pattern.period
     size = (round(pattern.w * scale) // STRIDE * STRIDE, round(pattern.h * scale) // STRIDE * STRIDE)
     column, row = np.meshgrid(*((np.arange(n // STRIDE) + 0.5) / (n // STRIDE) for n in size))
@@ -372,7 +372,7 @@ _WIDEST_EDGE = 1.8  # sigma of the sharpest edges, pixels: lines of a period of 
 
 @dataclass(frozen=True)
 class Cause:
-    """What was measured, and what to do about it."""
+    """A measured cause of a failure, and its remedy."""
 
     words: str
     remedy: str
@@ -441,7 +441,7 @@ def _misfit(found: DetectedGrid, detector: GridDetector) -> list[Cause]:
 
 
 def _blur(grey: Float32[ndarray, "h w"], found: DetectedGrid | None, pattern: GridPattern) -> list[Cause]:
-    """Of the lines if there is a grid, of the sharpest edges if there is none."""
+    """Check for blur: of the lines if there is a grid, else of the sharpest edges."""
     remedy = "capture again in focus and with nothing moving"
     if found is None or not shows_grid(found.graph):
         width = edge_width(grey)

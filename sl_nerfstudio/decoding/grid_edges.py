@@ -1,4 +1,4 @@
-"""What was trained and comes with the package."""
+"""The trained networks that come with the package, and the choice of coordinates beside edges."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -246,7 +246,7 @@ _OWN = 2.0  # log odds of the pixel itself at the beginning of the training
 
 
 class EdgeOutput(NamedTuple):
-    """What the network predicts for every pixel of its input."""
+    """Prediction of the network for every pixel of its input."""
 
     step: Float[Tensor, "b k h w"]  # logit of each of `continuation.steps`
     wrong: Float[Tensor, "b h w"]  # logit: more than a tenth of a period off, or the pattern is not here

@@ -153,7 +153,7 @@ def draw_sharpnesses(picture: Float32[ndarray, "h w"], period: float) -> tuple[D
 
 @dataclass(frozen=True)
 class GridLight:
-    """How much light a pattern value of one adds at a pixel, and how much is there without the pattern.
+    """Light that a pattern value of one adds at each pixel, and light without the pattern.
 
     On a surface that gets darker to one side, a line compared with an evenly lit one would seem shifted to the other
     side.
@@ -192,7 +192,7 @@ _LEAST_AGREEMENT, _LEAST_SEEN = 0.05, 0.05  # with which the variance of a shift
 
 
 class ShiftFit(NamedTuple):
-    """What moves the drawn pattern onto the image at each pixel."""
+    """Shift that moves the drawn pattern onto the image at each pixel."""
 
     shift: Float32[ndarray, "h w 2"]  # of the coordinates, periods
     agreement: Float32[ndarray, "h w"]  # correlation of image and pattern
@@ -275,7 +275,7 @@ def _add_products(image: ndarray, drawn: ndarray, trust: ndarray, step: int, out
 def _contrast_and_brightness(
     m: Float32[ndarray, "2 h w 4"],
 ) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
-    """By least squares; the contrast is at least a quarter of that in the well lit parts of the image."""
+    """Fit contrast and brightness by least squares; the contrast is at least a quarter of that of well lit parts."""
     n = np.maximum(m[0, ..., 0], 1e-6)
     mp, pp, mi, ip = m[0, ..., 1] / n, m[0, ..., 2] / n, m[0, ..., 3] / n, m[1, ..., 0] / n
     variance = np.maximum(pp - mp * mp, 1e-6)
@@ -421,7 +421,7 @@ def _refine(
 def _smooth(
     coords: Float32[ndarray, "h w 2"], inside: Bool[ndarray, "h w"], pixels_a_period: float, period: float
 ) -> Float32[ndarray, "h w 2"]:
-    """On planes that are near the pixel's own coordinates."""
+    """Smooth coordinates on planes that are near each pixel's own coordinates."""
 
     def is_near(apart: Float32[ndarray, "h w 2"], limit: float) -> Bool[ndarray, "h w"]:
         return apart[..., 0] ** 2 + apart[..., 1] ** 2 < (limit * period) ** 2

@@ -186,7 +186,7 @@ def _find_nodes(maps: PhaseMaps) -> tuple[Float32[ndarray, "n 2"], Float32[ndarr
 def _without_twins(
     place: Float32[ndarray, "n 2"], jacobian: Float32[ndarray, "n 2 2"], crest: Float32[ndarray, "n"]
 ) -> Bool[ndarray, "n"]:
-    """Of peaks less than half a period apart, only the highest."""
+    """Keep only the highest of peaks that are less than half a period apart."""
     kept = np.ones(len(place), dtype=bool)
     if len(place) < 2:
         return kept
@@ -479,7 +479,7 @@ class GraphNetwork(nn.Module):
         return nn.functional.normalize(out, dim=1)
 
     def logits(self, node: Float[Tensor, "n features"], candidate: Float[Tensor, "m features"]) -> Float[Tensor, "n m"]:
-        """How similar each node is to each candidate."""
+        """Similarity of each node to each candidate."""
         return self.log_scale.exp() * node @ candidate.T
 
 

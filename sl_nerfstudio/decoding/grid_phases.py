@@ -50,7 +50,7 @@ MULTIPLE = STRIDE * 2 ** (len(_WIDTHS) - 1)
 
 
 class NetworkOutput(NamedTuple):
-    """What the network predicts, at half the resolution of its input; places lie where four pixels meet."""
+    """Prediction of the network, at half the resolution of its input; places lie where four pixels meet."""
 
     mask: Float[Tensor, "b h w"]  # logit: the pattern is here
     phase: Float[Tensor, "b 4 h w"]  # cosine and sine of the phase in x, then in y; both 0 where unknown
@@ -221,7 +221,7 @@ _LARGEST_SIDE = 3000  # of a rectified image, pixels
 
 @dataclass(frozen=True)
 class GridAppearance:
-    """How the grid appears in an image."""
+    """Appearance of the grid in an image."""
 
     period: float  # pixels
     roll: float  # radian, clockwise, of the lines that are closest to horizontal; within an eighth of a turn
@@ -277,7 +277,7 @@ def rectify(image: Float32[ndarray, "h w"], appearance: GridAppearance) -> Recti
 
 
 def integer_centres(affine: Float64[ndarray, "2 3"]) -> Float64[ndarray, "2 3"]:
-    """The same map for pixel coordinates whose first centre is 0, as in OpenCV."""
+    """Convert a map to pixel coordinates whose first centre is 0, as in OpenCV."""
     out = affine.copy()
     out[:, 2] += affine[:, :2] @ np.array([0.5, 0.5]) - 0.5
     return out
@@ -396,7 +396,7 @@ def sample_pixels(maps: PhaseMaps, rectified: RectifiedImage, shape: tuple[int, 
 
 
 def map_from_pixels(rectified: RectifiedImage) -> Float64[ndarray, "2 3"]:
-    """From pixels (x, y, 1) of the capture to places in the network's maps; in both the first centre is 0."""
+    """Map from pixels (x, y, 1) of the capture to places in the network's maps; in both the first centre is 0."""
     to_map = np.array([[1 / STRIDE, 0, 0.5 / STRIDE - 0.5], [0, 1 / STRIDE, 0.5 / STRIDE - 0.5]])
     return to_map @ np.vstack([integer_centres(rectified.from_image), [0.0, 0.0, 1.0]])
 

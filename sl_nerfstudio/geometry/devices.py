@@ -42,7 +42,7 @@ class Device:
         return np.array([getattr(self, key) for key in PARAMETERS], dtype=np.float64)
 
     def scaled(self, factor: float) -> "Device":
-        """The same device with its image resized by `factor` (no half-pixel shift, because centres are at .5)."""
+        """Resize the device's image by `factor` (no half-pixel shift, because centres are at .5)."""
         return replace(
             self,
             w=round(self.w * factor),
@@ -79,11 +79,11 @@ class Intrinsics:
         return Intrinsics(self.params[index], self.model, self.distorted)
 
     def to(self, *args: torch.device | torch.dtype | str) -> "Intrinsics":
-        """On another torch device, or with another dtype."""
+        """Copy to another torch device or dtype."""
         return Intrinsics(self.params.to(*args), self.model, self.distorted)  # pyright: ignore[reportCallIssue, reportArgumentType]
 
     def reshape(self, *shape: int) -> "Intrinsics":
-        """With another batch shape, for broadcasting against points."""
+        """Change the batch shape, for broadcasting against points."""
         return Intrinsics(self.params.reshape(*shape, 8), self.model, self.distorted)
 
 
@@ -234,7 +234,7 @@ MODELS: dict[DeviceKind, DeviceModel] = {
 
 
 def for_loops(device: Device) -> tuple[int, Float64[ndarray, "8"]]:
-    """What compiled loops take for a device: the code of its model, and its PARAMETERS."""
+    """Arguments of compiled loops for a device: the code of its model, and its PARAMETERS."""
     return MODELS[device.model].code, device.parameters
 
 
@@ -404,7 +404,7 @@ class IntrinsicsChange:
 
     @staticmethod
     def of(values: Sequence[float]) -> "IntrinsicsChange":
-        """From six numbers: focal, x, y of the cameras, then of the projector."""
+        """Create from six numbers: focal, x, y of the cameras, then of the projector."""
         camera, projector = values[:3], values[3:]
         return IntrinsicsChange(DeviceChange(*camera), DeviceChange(*projector))
 

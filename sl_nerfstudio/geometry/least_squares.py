@@ -53,7 +53,7 @@ class NormalEquations:
         return NormalEquations(weighted.T @ J, weighted.T @ r)
 
     def with_prior(self, offset: Float64[ndarray, "n"], information: Float64[ndarray, "n n"]) -> "NormalEquations":
-        """The same with a Gaussian prior whose mean lies at `-offset` from the state."""
+        """Add a Gaussian prior whose mean lies at `-offset` from the state."""
         return NormalEquations(self.H + information, self.g + information @ offset)
 
     def step(self, damping: float) -> Float64[ndarray, "n"]:
@@ -97,7 +97,7 @@ class BlockEquations:
         return shared, self.blocks_after(shared, damping)
 
     def slopes(self) -> Float64[ndarray, "b k s"]:
-        """How far each block moves back where the shared unknowns move: H_block^-1 coupling^T."""
+        """Response of each block to the shared unknowns, with the opposite sign: H_block^-1 coupling^T."""
         return np.linalg.solve(self._damped(0.0), self.coupling.transpose(0, 2, 1))
 
     def blocks_after(self, shared: Float64[ndarray, "s"], damping: float = 0.0) -> Float64[ndarray, "b k"]:
@@ -122,7 +122,7 @@ class BlockEquations:
 
 @dataclass(frozen=True)
 class Minimum(Generic[State]):
-    """Where a search has ended."""
+    """End of a search."""
 
     state: State
     cost: float

@@ -212,7 +212,7 @@ class Similarity:
         return Similarity(self.scale * other.scale, self.R @ other.R, self.points(other.t))
 
     def matrix(self) -> Float[ndarray, "4 4"]:
-        """The same map as a 4x4 matrix, for homogeneous coordinates."""
+        """The map as a 4x4 matrix, for homogeneous coordinates."""
         out = np.eye(4)
         out[:3, :3] = self.scale * self.R
         out[:3, 3] = self.t
@@ -284,7 +284,7 @@ class Similarities:
 
     @staticmethod
     def of(each: Sequence[Similarity]) -> "Similarities":
-        """From at least one."""
+        """Stack a non-empty sequence."""
         scale, R, t = zip(*((S.scale, S.R, S.t) for S in each), strict=True)
         return Similarities(np.array(scale), np.stack(R), np.stack(t))
 
@@ -301,7 +301,7 @@ class Similarities:
         return self.scale[:, None] * (self.R @ p[..., None])[..., 0] + self.t
 
     def orthonormal(self) -> "Similarities":
-        """With the rotations nearest to their matrices.
+        """Replace each matrix by the nearest rotation.
 
         `inverse` transposes, and products of similarities and inverses double what is not orthonormal, again and again:
         rounding errors become large where components are joined a hundred times.
@@ -309,7 +309,7 @@ class Similarities:
         return Similarities(self.scale, Rotation.from_matrix(self.R).as_matrix(), self.t)
 
     def inverse(self) -> "Similarities":
-        """Of each."""
+        """Element-wise inverse."""
         R = self.R.transpose(0, 2, 1)
         return Similarities(1 / self.scale, R, -(R @ self.t[..., None])[..., 0] / self.scale[:, None])
 
@@ -402,7 +402,7 @@ class DevicePoses:
         return np.concatenate([self.T_world_camera, self.T_world_projector])
 
     def mapped(self, S_target_world: Similarity) -> "DevicePoses":
-        """The same devices in other axes and another unit; orientations stay rotations."""
+        """Map the poses to other axes and another unit; orientations stay rotations."""
         return DevicePoses(S_target_world.poses(self.T_world_camera), S_target_world.poses(self.T_world_projector))
 
 
@@ -448,7 +448,7 @@ def _with_two_products(w, v, first, second):
 
 @compiled
 def _rotation_vector(A, B):
-    """Of A B^T, for two rotations (or poses); by its unit quaternion, which is accurate near 0 and pi."""
+    """Rotation vector of A B^T, of two rotations (or poses), by its unit quaternion: accurate near 0 and pi."""
     m = [0.0] * 9
     for i in range(3):
         for j in range(3):

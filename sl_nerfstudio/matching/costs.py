@@ -1,4 +1,4 @@
-"""How badly image and pattern match at every pixel for every inverse distance, and the distances that cost least.
+"""Matching costs of image and pattern at every pixel for every inverse distance, and the distances that cost least.
 
 Costs are correlations in Gaussian windows. Semi-global matching (Hirschmueller, "Stereo processing by semiglobal
 matching and mutual information", PAMI 2008) adds them up along eight ways to each pixel; changes of distance cost a

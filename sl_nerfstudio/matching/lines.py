@@ -1,4 +1,4 @@
-"""Where in the projector's image the ray of each camera pixel runs, by the inverse distance along it.
+"""Epipolar lines: the ray of each camera pixel in the projector's image, by the inverse distance along it.
 
 Lengths in an image are in periods of the pattern as it appears there.
 """

@@ -72,7 +72,7 @@ LEAST_AREA = 1.0  # smaller regions are left out, periods squared
 
 @dataclass(frozen=True)
 class DecodedImage:
-    """What matching starts from."""
+    """Input of the matching."""
 
     grey: Float32[ndarray, "h w"]
     coords: Float32[ndarray, "h w 2"]  # decoded, pattern pixels; NaN where not
@@ -222,7 +222,7 @@ def _box(seen: Bool[ndarray, "h w"], margin: int) -> tuple[slice, slice]:
 
 @dataclass(frozen=True)
 class LineFit:
-    """What the fit needs besides the matches: the pattern, and how large a period is in the image."""
+    """Fit of matches to the image, for a pattern and the size of its period in the image."""
 
     grid: DrawnGrid
     pixels_a_period: float

@@ -103,7 +103,7 @@ def _encode(columns: dict[str, tuple[str, ndarray]], unit: str, element: list[st
 
 
 def read_quality(path: Path) -> VertexQuality | None:
-    """What `encode_ply` wrote with a mesh; None for any other file."""
+    """Read what `encode_ply` wrote with a mesh; None for any other file."""
     with path.open("rb") as stream:
         if stream.read(3) != b"ply":
             return None

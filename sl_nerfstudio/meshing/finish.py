@@ -181,7 +181,7 @@ _MANY = 50  # points, of which the convex hull is found before they are compared
 
 @dataclass(frozen=True)
 class FilledHoles:
-    """Which holes were closed, and which were not."""
+    """Holes that were closed, and those that were not."""
 
     kept: Bool[ndarray, "f"]  # triangles of the whole mesh: those of the trimmed mesh, and those that close holes
     closed: int  # holes

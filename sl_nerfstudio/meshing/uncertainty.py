@@ -122,7 +122,7 @@ _FEWEST = 20  # values of which a spread is stated
 
 @dataclass(frozen=True)
 class FrameViews:
-    """What one frame confirms of a mesh; lengths in the scan's unit."""
+    """Vertices that one frame confirms; lengths in the scan's unit."""
 
     vertex: Int64[ndarray, "m"]  # ascending
     slope: Float[ndarray, "m 2"]  # of the residual along the normal, projector pixels per unit of length
@@ -256,7 +256,7 @@ class VertexSums:
     bits: UInt8[ndarray, "frames eighth"]  # which frames confirm which vertices, eight in a byte
 
     def confirmed(self, vertices: Int64[ndarray, "n"]) -> Bool[ndarray, "n frames"]:
-        """Which frames confirm some vertices."""
+        """Frames that confirm some vertices."""
         return (self.bits[:, vertices // 8].T >> (7 - vertices % 8)[:, None]) & 1 > 0
 
 

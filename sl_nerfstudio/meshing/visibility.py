@@ -1,4 +1,4 @@
-"""Which frames see, confirm or contradict each vertex of a mesh, and the part of it that they observed."""
+"""Visibility: frames that see, confirm or contradict each vertex of a mesh, and the part that they observed."""
 
 import math
 from dataclasses import dataclass, replace

@@ -39,7 +39,7 @@ class Plane:
         return p_world @ self.normal - self.offset
 
     def flipped(self) -> "Plane":
-        """The same plane with the other side up."""
+        """Turn the other side up."""
         return Plane(-self.normal, -self.offset)
 
     def axes(self) -> Float64[ndarray, "2 3"]:
@@ -145,7 +145,7 @@ def normals_of(points: FramePoints) -> Float64[ndarray, "n 3"]:
 
 
 def cross_frame_noise(frames: Sequence[FramePoints], normals: Sequence[Float[ndarray, "_n 3"]]) -> float:
-    """How much farther points of different frames are from each other than their own noise explains; at least 1.
+    """Distance between points of different frames over what their own noise explains; at least 1.
 
     Every frame is compared with some others, one by one: each point with the tangent plane at the nearest point there.
     What exceeds the noise of coordinates is error of the poses.
@@ -513,7 +513,7 @@ def _well_inside(
 def _what_stands_on_it(
     plane: Plane, on: Float[ndarray, "n 3"], above: Float[ndarray, "m 3"], region: ViewedRegion
 ) -> tuple[float, float, float]:
-    """How much more than what rises from it a plane is.
+    """Compare a plane with what rises from it.
 
     Returns its bare area in areas of what rises, the height of that in roots of its area, and the share of the
     directions in which the plane extends beyond it.

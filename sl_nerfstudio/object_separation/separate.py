@@ -183,7 +183,7 @@ def _near_main(
 
 
 class Part(IntEnum):
-    """What a pixel shows."""
+    """Part of the scene that a pixel shows."""
 
     NOTHING = 0  # the pattern was not seen
     OBJECT = 1
@@ -203,7 +203,7 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class Separation:
-    """Which pixels and points belong to the object."""
+    """Decision which pixels and points belong to the object."""
 
     region: ViewedRegion
     findings: tuple[PlaneFinding, ...]  # all planes that were judged

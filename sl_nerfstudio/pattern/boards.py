@@ -72,7 +72,7 @@ class Chessboard:
         return _grid_corners(self.columns, self.rows, self.square)
 
     def black(self) -> Bool[ndarray, "rows columns"]:
-        """Which squares are black."""
+        """Mask of the black squares."""
         columns, rows = self.squares
         return np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0
 
@@ -113,7 +113,7 @@ class CharucoBoard:
         return _grid_corners(self.columns - 1, self.rows - 1, self.square)
 
     def black(self) -> Bool[ndarray, "rows columns"]:
-        """Which squares are black."""
+        """Mask of the black squares."""
         first_is_white = self.legacy and self.rows % 2 == 0
         return np.add.outer(np.arange(self.rows), np.arange(self.columns)) % 2 == int(first_is_white)
 
@@ -133,7 +133,7 @@ class CharucoBoard:
         return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
 
     def _bits(self, number: int) -> Bool[ndarray, "bits bits"]:
-        """Which cells of a marker are black; one cell of border on each side."""
+        """Mask of a marker's black cells; one cell of border on each side."""
         return cv2.aruco.generateImageMarker(self._markers, number, self._markers.markerSize + 2, borderBits=1) == 0
 
 
@@ -192,7 +192,7 @@ class Line:
 
 @dataclass(frozen=True, eq=False)
 class PrintedPage:
-    """What is printed; lengths in mm, x right and y down from the page's upper left corner."""
+    """A page to print; lengths in mm, x right and y down from the page's upper left corner."""
 
     width: float
     height: float
@@ -297,7 +297,7 @@ def lay_out(board: Board) -> BoardPage:
 
 
 def description(board: Board) -> str:
-    """What the board is, in one line."""
+    """Describe the board in one line."""
     if isinstance(board, Chessboard):
         return f"chessboard, {board.columns} x {board.rows} inner corners, squares {board.square:g} mm"
     return (

@@ -191,7 +191,7 @@ def hamming_margins(codes: Int[ndarray, "rows columns"]) -> tuple[int, int]:
 
 
 def _most_alike(a: Int[ndarray, "n cells"], b: Int[ndarray, "m cells"], with_itself: bool) -> int:
-    """In how many cells a window of `a` and one of `b` agree at most; `with_itself`: also those of the same index."""
+    """Largest number of equal cells of a window of `a` and one of `b`; `with_itself`: also of the same index."""
     most = 0
     there = _one_hot(b).T
     for start in range(0, len(a), _BLOCK):  # all pairs at once would take gigabytes

@@ -170,7 +170,7 @@ class GrayCode(PatternLayout):
 
     @property
     def scope(self) -> Scope:
-        """What the orders of programs depend on."""
+        """Sizes that the orders of other programs depend on."""
         x, y = (min((sine[1] for sine in self.sines(axis)), default=float(max(self.cell, 2))) for axis in (0, 1))
         return Scope((self.w, self.h), self.bits, (x, y))
 

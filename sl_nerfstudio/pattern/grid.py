@@ -112,7 +112,7 @@ def _fit(
     picture: Float32[ndarray, "ph pw"],
     sigma: float,
 ) -> _Fit:
-    """With one picture; `image_means` are those of the weight, of the grey and of its square."""
+    """Fit one picture; `image_means` are those of the weight, of the grey and of its square."""
     drawn = cv2.remap(picture, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     drawn = drawn * weight
     p, pp, ip = cv2.split(gaussian_window(np.dstack([drawn, drawn * drawn, grey * drawn]), sigma))
@@ -219,7 +219,7 @@ class GridPattern(PatternLayout):
 
     @cached_property
     def margins(self) -> tuple[int, int]:
-        """In how many of 9 symbols 3 x 3 windows differ at least: upright, and where the camera may roll."""
+        """Smallest number of the 9 symbols in which 3 x 3 windows differ: upright, and where the camera may roll."""
         return hamming_margins(np.asarray(self.codes))
 
     @property

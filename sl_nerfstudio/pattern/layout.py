@@ -1,4 +1,4 @@
-"""What every kind of pattern offers: its size, a picture of it, and its description for pattern.json."""
+"""Interface of patterns: size, picture, and description for pattern.json."""
 
 import json
 import math
@@ -48,7 +48,7 @@ class PatternLayout(ABC):
 
     @abstractmethod
     def fields(self) -> dict[str, Any]:
-        """What pattern.json holds besides format, kind, image and size: JSON values."""
+        """Fields of pattern.json besides format, kind, image and size: JSON values."""
 
     @classmethod
     @abstractmethod
@@ -74,7 +74,7 @@ def number(document: dict[str, Any], key: str) -> float:
 
 
 def whole_number(document: dict[str, Any], key: str) -> int:
-    """The same for whole numbers."""
+    """Read a whole number; errors are those of `number`."""
     value = number(document, key)
     if value != math.floor(value):
         raise ValueError(f"{key} is {value:g}, not a whole number")
@@ -115,7 +115,7 @@ LONGEST = 200  # images of a sequence
 
 @dataclass(frozen=True)
 class ShownImage:
-    """What one image shows: all white, all black, a bit of the cell's Gray code, or a shifted sine."""
+    """Content of one image: all white, all black, a bit of the cell's Gray code, or a shifted sine."""
 
     what: Literal["white", "black", "bit", "phase"]
     axis: int = 0  # 0: along x, 1: along y
@@ -168,7 +168,7 @@ def phases(axis: int, steps: int, period: float) -> list[ShownImage]:
 
 @dataclass(frozen=True)
 class Scope:
-    """What an order depends on."""
+    """Sizes that an order depends on."""
 
     size: tuple[int, int]  # (w, h) of the pattern
     bits: tuple[int, int]  # of the cell's column and row
@@ -184,7 +184,7 @@ def _opencv(scope: Scope) -> list[ShownImage]:
 
 
 def _scan3d(scope: Scope) -> list[ShownImage]:
-    """As many bits of the one axis as of the other: the finest of the longer axis are not shown."""
+    """Show as many bits of one axis as of the other: the finest of the longer axis are left out."""
     count = 2 * min(scope.bits)
     both = [bits_with_inverses(axis, scope.bits[axis])[:count] for axis in (0, 1)]
     return [*HEAD, *both[0], *both[1]]

@@ -295,7 +295,7 @@ class ShownPattern:
 
 @dataclass(frozen=True)
 class Measured:
-    """What was found at some pixels; lengths in pattern pixels."""
+    """Measurements at some pixels; lengths in pattern pixels."""
 
     places: Int64[ndarray, "n 2"]  # row, column
     coords: Float32[ndarray, "n 2"]
@@ -401,7 +401,7 @@ _COVERED = 0.5  # share of the window that must be on the surface
 
 @dataclass(frozen=True)
 class AcceptanceLimits:
-    """What a coordinate must fulfil; lengths in pattern pixels."""
+    """Limits for accepting a coordinate; lengths in pattern pixels."""
 
     correlation: float  # least
     margin: float  # least

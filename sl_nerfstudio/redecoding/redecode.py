@@ -48,7 +48,7 @@ _OWN = 2.0  # edge lengths: a hit this close before a point is the surface on wh
 
 @dataclass(frozen=True)
 class Prediction:
-    """What each pixel of a frame should see; NaN where it sees no surface that the projector lights."""
+    """Prediction for each pixel of a frame; NaN where it sees no surface that the projector lights."""
 
     coords: Float32[ndarray, "h w 2"]  # pattern pixels
     along: Float32[ndarray, "h w 2"]  # unit direction in which a coordinate moves with the depth of its point
@@ -86,7 +86,7 @@ class PredictedSurface:
         T_world_camera: Float[ndarray, "4 4"],
         T_world_projector: Float[ndarray, "4 4"],
     ) -> Prediction:
-        """What the camera sees of the pattern that the projector throws on the surface."""
+        """Predict what the camera sees of the pattern that the projector throws on the surface."""
         uv = pixel_centres(camera, torch.float64).reshape(-1, 2)
         pose = torch.as_tensor(T_world_camera, dtype=torch.float64)
         direction = pixel_rays(Intrinsics.of(camera, torch.float64), pose, uv)[1].numpy()
@@ -151,7 +151,7 @@ _TEAR = 0.35  # pitch between neighbouring pixels of one region
 
 @dataclass(frozen=True)
 class RedecodedFacts:
-    """What became of the pixels of a frame; numbers of pixels."""
+    """Outcome for the pixels of a frame; numbers of pixels."""
 
     name: str
     shown: int  # where the pattern falls on the object
@@ -255,7 +255,7 @@ def _inside(view: PatternView) -> Bool[ndarray, "h w"]:
 
 
 def _stretch(coords: Float32[ndarray, "h w 2"]) -> Float32[ndarray, "h w"]:
-    """How far a predicted coordinate is from those of the neighbouring pixels; the larger neighbour counts."""
+    """Distance of a predicted coordinate from those of the neighbouring pixels; the larger neighbour counts."""
     total = np.zeros(coords.shape[:2], dtype=np.float32)
     for axis in (0, 1):
         step = np.linalg.norm(np.diff(coords, axis=axis), axis=-1)
@@ -283,7 +283,7 @@ def _as_shown(
 def _elsewhere(
     view: PatternView, along: Float32[ndarray, "h w 2"], shown: ShownPattern, places: Int64[ndarray, "n 2"]
 ) -> Measured:
-    """What is found if the prediction is displaced by some pitches: matches at places that are certainly wrong."""
+    """Match with the prediction displaced by some pitches: places that are certainly wrong."""
     some = places[evenly_spaced(len(places), min(_ELSEWHERE, len(places)))]
     decoys = shown.ambiguity.decoys
     parts = []
@@ -351,7 +351,7 @@ RECORD = "redecoding.json"
 
 @dataclass(frozen=True)
 class Redecoded:
-    """What became of the frames."""
+    """Outcome for all frames."""
 
     frames: tuple[RedecodedFacts, ...]
 

@@ -189,7 +189,7 @@ def relative_pose_near(
 
 @dataclass(frozen=True)
 class _Frame:
-    """What all solutions of a frame have in common."""
+    """Data that all solutions of a frame share."""
 
     correspondences: int  # that were given
     usable: Int64[ndarray, "m"]  # those that have rays

@@ -97,7 +97,7 @@ def _products(
 
 
 def _cross(a: Float64[ndarray, "n 3"], b: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
-    """As numpy's, in half of its time, and of a few vectors in a tenth."""
+    """Cross products of rows; twice as fast as numpy's, and ten times for a few vectors."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)
 
@@ -183,7 +183,7 @@ _PARTS: dict[Part, tuple[int, ...]] = {"focal length": (0,), "principal point": 
 
 @dataclass(frozen=True)
 class DeviceEvidence:
-    """What the frames say of one device, if the other one is right. Shares are of its focal length."""
+    """Evidence of the frames on one device, if the other one is right. Shares are of its focal length."""
 
     device: Device  # as stated
     change: Float64[ndarray, "3"]  # of focal length and principal point x, y, shares; for which frames agree best
@@ -210,7 +210,7 @@ class Explanation:
 
 @dataclass(frozen=True)
 class IntrinsicsEvidence:
-    """What the frames say of both devices, each alone."""
+    """Evidence of the frames on both devices, each alone."""
 
     projector: DeviceEvidence
     camera: DeviceEvidence
@@ -229,7 +229,7 @@ class IntrinsicsEvidence:
         )
 
     def explanations(self) -> list[Explanation]:
-        """What would explain the contradiction: a single part of one device, if one does; else either device.
+        """Explanations of the contradiction: a single part of one device, if one suffices; else either device.
 
         A wrong projector and a wrong camera look alike. But a focal length of the one is focal length and principal
         point of the other, so that few wrong values tell whose they are.

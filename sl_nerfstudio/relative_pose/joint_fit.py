@@ -104,7 +104,7 @@ class PointMatches:
         return PointMatches(*rays, self.frame[keep], self.block[keep], self.frames)
 
     def of_frame(self, k: int) -> slice:
-        """Where a frame's correspondences are."""
+        """Slice of a frame's correspondences."""
         return slice(*np.searchsorted(self.frame, [k, k + 1]).tolist())
 
     def rays(self, projector: Device) -> RayPairs:
@@ -251,7 +251,7 @@ class JointProblem:
         return Linearised(equations, J_free, J, wr)
 
     def scores(self, at: Linearised) -> Float64[ndarray, "blocks free"]:
-        """What each square of the pattern in each frame adds to the gradient, with the poses eliminated."""
+        """Contribution of each square of the pattern in each frame to the gradient, with the poses eliminated."""
         slopes = at.equations.slopes()[self._matches.frame]
         unexplained = at.by_free - np.einsum("nk,nks->ns", at.by_pose, slopes)
         scores = np.zeros((int(self._block.max(initial=0)) + 1, len(self._free)))

@@ -169,7 +169,7 @@ def _refined(
 
 
 def _poses_with(frames: Sequence[FrameMatches], projector: Device, seed: int) -> tuple[int, dict[int, UnitPose]]:
-    """How many frames have a relative pose with a projector, and the poses of those that show depth, by number."""
+    """Count the frames that have a relative pose with a projector; poses of those that show depth, by number."""
     posed, firm = 0, {}
     for k, frame in enumerate(frames):
         try:
@@ -185,7 +185,7 @@ def _poses_with(frames: Sequence[FrameMatches], projector: Device, seed: int) ->
 
 
 def _matches(frames: Sequence[FrameMatches], device: Device, seed: int) -> PointMatches:
-    """As many correspondences as the joint fit takes."""
+    """Draw as many correspondences as the joint fit takes."""
     most = min(MOST_PER_FRAME, max(MOST_MATCHES // len(frames), 1))
     return PointMatches.of(frames, device, most, np.random.default_rng(seed))
 
@@ -205,7 +205,7 @@ def _uncertainty(found: JointFit) -> float:
 
 
 def _cause(found: JointFit, used: int, frames: int) -> Cause:
-    """What was measured that explains why the focal length is uncertain."""
+    """The measured cause of an uncertain focal length."""
     R, t = Rotation.from_matrix([R for R, _ in found.poses]), np.stack([t for _, t in found.poses])
     turns = np.degrees((R * R[0].inv()).magnitude())
     swings = np.degrees(np.arccos((t @ t[0]).clip(-1, 1)))
@@ -388,7 +388,7 @@ def _left_out(
 
 
 def _gain(base: Float64[ndarray, "n"], other: Float64[ndarray, "n"], matches: PointMatches) -> tuple[float, float]:
-    """How much less the other model costs, and the standard error; squares are independent."""
+    """Gain in cost by the other model, and its standard error; squares are independent."""
     _, block = np.unique(matches.block, return_inverse=True)
     sums = np.bincount(block, base - other)
     return float(sums.sum()), float(np.sqrt((sums**2).sum()))

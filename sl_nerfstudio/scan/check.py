@@ -149,7 +149,7 @@ def _range_problems(values: Float32[ndarray, "n 2"], projector: Device) -> Itera
 
 
 def _beyond(values: Float32[ndarray, "n 2"], size: Float32[ndarray, "2"], margin: float) -> Bool[ndarray, "n"]:
-    """Which values lie outside a pattern of `size` by more than `margin` sizes."""
+    """Find values outside a pattern of `size` by more than `margin` sizes."""
     x, y = values[:, 0] / size[0], values[:, 1] / size[1]
     return (x < -margin) | (x > 1 + margin) | (y < -margin) | (y > 1 + margin)
 
@@ -178,7 +178,7 @@ def _doe_problems(values: Float32[ndarray, "n 2"], projector: Device) -> Iterato
 
 @dataclass(frozen=True)
 class FrameContent:
-    """What is kept of a frame after its pixels were checked."""
+    """Facts kept of a frame after its pixels were checked."""
 
     name: str
     digest: bytes | None  # of image and coordinates; None if either could not be read
@@ -265,7 +265,7 @@ def check_content(
 
 
 def read_shown(frame: PartialFrame, good: set[Path]) -> Shown | None:
-    """What a frame shows of the pattern, and where; None if a file of it is damaged or absent."""
+    """Read what a frame shows of the pattern, and where; None if one of its files is damaged or absent."""
     path, mask_path = frame.paths.get("sl_pattern_path", frame.paths.get("file_path")), frame.paths.get("mask_path")
     if path not in good:
         return None

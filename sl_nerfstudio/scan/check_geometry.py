@@ -1,4 +1,4 @@
-"""How well the rays of a scan's frames meet, and how well their surfaces agree: the geometry that sl-check judges."""
+"""Geometry that sl-check judges: how well the rays of a scan's frames meet, and how well their surfaces agree."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -86,7 +86,7 @@ _LOOK_UP = 0.5  # error that no decoder and no calibration is assumed to be free
 
 @dataclass(frozen=True)
 class GeometricFit:
-    """How well rays meet and frames agree under one interpretation, frame by frame."""
+    """Fit of rays and frames under one interpretation, frame by frame."""
 
     residual_px: Float64[ndarray, "n"]  # median epipolar residual; inf: most points are behind a device
     spread: Float64[ndarray, "n"]  # median distance to the points of other frames, in depths; inf: too few points

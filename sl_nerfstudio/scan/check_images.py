@@ -33,7 +33,7 @@ def pattern_shift(
     captured: Float32[ndarray, "h w"],
     pattern: Float32[ndarray, "rows columns"],
 ) -> Float64[ndarray, "2"] | None:
-    """What to add to the coordinates of one frame, in pattern pixels, for the best match; None if unclear."""
+    """Measure the shift to add to one frame's coordinates, in pattern pixels, for the best match; None if unclear."""
     chosen = np.flatnonzero(where)
     chosen = chosen[:: max(1, len(chosen) // _PIXELS)]
     if len(chosen) < _FEWEST_SHIFTED:
@@ -107,7 +107,7 @@ _WINDOW = 256  # side of the square, around the middle of the decoded pixels, in
 
 @dataclass(frozen=True)
 class ImagePrediction:
-    """What a frame should show at some of its pixels."""
+    """Prediction of a frame's image at some of its pixels."""
 
     rows: Int64[ndarray, "n"]
     columns: Int64[ndarray, "n"]
@@ -134,7 +134,7 @@ class ImagePrediction:
 
 @dataclass(frozen=True)
 class ImageMatch:
-    """How well one image of a frame shows the pattern at the frame's coordinates."""
+    """Correlation of one image of a frame with the pattern at the frame's coordinates."""
 
     correlation: float
     moved: float  # the same after the best move

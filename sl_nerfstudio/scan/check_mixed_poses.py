@@ -51,7 +51,7 @@ def is_suspect(fit: GeometricFit, focal: float) -> bool:
 
 
 def suspect_frames(fit: GeometricFit, focal: float) -> ndarray:
-    """Which frames' rays miss each other by more than is stated of them, or else usual."""
+    """Find frames whose rays miss each other by more than is stated for them, or else usual."""
     stated = np.where(np.isnan(fit.stated_px), SUSPECT * focal, SUSPECT_SIGMAS * fit.stated_px)
     return fit.residual_px > stated
 
@@ -248,7 +248,7 @@ class _Motions:
 
     @staticmethod
     def of(frames: Sequence[Correspondences], projector: Device) -> "_Motions":
-        """At most some frames and points, spread over all."""
+        """Choose a limited number of frames and points, spread over all."""
         some = frames[:: max(1, len(frames) // _MOST_FRAMES)]
         step = max(1, len(some[0].uv_camera) // _POINTS)
         tensor = torch.from_numpy

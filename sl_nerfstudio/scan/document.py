@@ -178,7 +178,7 @@ def document_faults(document: Record, file: str, faults: Faults) -> None:
 
 
 def frame_label(record: Any, index: int) -> str:
-    """How a frame is named in messages: the stem of its image, else its number counted from 0."""
+    """Name of a frame in messages: the stem of its image, else its number counted from 0."""
     path = record.get("file_path") if isinstance(record, dict) else None
     stem = Path(path).stem if isinstance(path, str) else ""
     return stem or f"#{index}"

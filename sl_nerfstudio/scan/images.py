@@ -46,7 +46,7 @@ _DAMAGE = (OSError, SyntaxError, ValueError, EOFError, TypeError, LookupError, O
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """What the header of an image file says; `mode` is "grey" or "RGB"."""
+    """Header of an image file; `mode` is "grey" or "RGB"."""
 
     w: int
     h: int
@@ -104,12 +104,8 @@ def read_pixels_and_orientation(
         return _plain_pixels(path, content, image), _orientation(path, image)
     header = _header(path, image)
     _orientation(path, image)
-    try:
+    with _decoding(path):
         image.load()
-    except MemoryError as error:
-        raise FileError(path, "does not fit into memory", "the image is huge", "use smaller images") from error
-    except _DAMAGE as error:
-        raise _undecodable(path, error) from error
     if isinstance(image, PngImageFile):
         _check_png_sums(path, content)
     orientation = _orientation(path, image)  # again: a PNG may have the tag after its pixels
@@ -193,12 +189,8 @@ def _plain_pixels(path: Path, content: bytes, image: ImageFile) -> UInt8[ndarray
     certain.
     """
     deep = ";16" in (str(image.tile[0][3]) if image.tile else "")
-    try:
+    with _decoding(path):
         values = _decode_deep(path, content, 4) if deep else np.array(image.convert("RGBA"))
-    except MemoryError as error:
-        raise FileError(path, "does not fit into memory", "the image is huge", "use smaller images") from error
-    except _DAMAGE as error:
-        raise _undecodable(path, error) from error
     if isinstance(image, PngImageFile):
         _check_png_sums(path, content)
     pixels, alpha = values[..., :3], values[..., 3]
@@ -216,13 +208,19 @@ def _plain_pixels(path: Path, content: bytes, image: ImageFile) -> UInt8[ndarray
     return np.ascontiguousarray(pixels[..., 0] if grey else pixels)
 
 
-def _undecodable(path: Path, error: Exception) -> FileError:
-    return FileError(
-        path,
-        f"cannot be decoded ({error})",
-        "the file is truncated or damaged, for example by an interrupted copy or a full disk",
-        "copy or export this image again",
-    )
+@contextmanager
+def _decoding(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except MemoryError as error:
+        raise FileError(path, "does not fit into memory", "the image is huge", "use smaller images") from error
+    except _DAMAGE as error:
+        raise FileError(
+            path,
+            f"cannot be decoded ({error})",
+            "the file is truncated or damaged, for example by an interrupted copy or a full disk",
+            "copy or export this image again",
+        ) from error
 
 
 def _check_png_sums(path: Path, content: bytes) -> None:

@@ -451,7 +451,7 @@ def check_headers(partial: PartialScan, faults: Faults) -> set[Path]:
 
 
 def relative(path: Path, root: Path) -> str:
-    """How messages name a file: its path below the folder, with slashes."""
+    """Name of a file in messages: its path below the folder, with slashes."""
     return path.relative_to(root).as_posix()
 
 

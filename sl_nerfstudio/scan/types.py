@@ -1,4 +1,4 @@
-"""What a scan folder holds, as frozen dataclasses; files are opened only by the `read_*` methods."""
+"""The content of a scan folder as frozen dataclasses; files are opened only by the `read_*` methods."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -223,7 +223,7 @@ class Frame:
         return read_image(self.image_path)
 
     def read_color(self) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None:
-        """The same view without the pattern, (h, w) grey or (h, w, 3) sRGB; None if it was not captured."""
+        """The view without the pattern, (h, w) grey or (h, w, 3) sRGB; None if it was not captured."""
         return None if self.color_path is None else read_image(self.color_path)
 
     def read_pattern(self) -> Float32[ndarray, "h w"]:
@@ -237,7 +237,7 @@ class Frame:
         return read_coords(self.coords_path)
 
     def read_mask(self) -> Bool[ndarray, "h w"]:
-        """Where the pattern falls on the object: the mask file, else where coordinates were decoded."""
+        """Pixels where the pattern falls on the object: the mask file, else where coordinates were decoded."""
         if self.mask_path is not None:
             return read_image(self.mask_path) > 0
         return np.isfinite(self.read_coords()).all(-1)

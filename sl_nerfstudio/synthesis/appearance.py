@@ -1,4 +1,4 @@
-"""How captures look: material, light, projector and lens of photographs, and the plain surface of grey images."""
+"""Appearance of captures: material, light, projector and lens of photographs, and the plain surface of grey images."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -462,7 +462,7 @@ _MOST_LAYERS_AROUND = 3  # of texture, on what is around the object
 
 @dataclass(frozen=True)
 class Look:
-    """How a scan looks; frames differ from it only by their `Shot`."""
+    """Appearance of a scan; frames differ from it only by their `Shot`."""
 
     material: Material
     material_around: Material

@@ -1,4 +1,4 @@
-"""What a synthetic scan is made of; the docstrings of the fields are the help text of `sl-synth`."""
+"""Settings of a synthetic scan; the docstrings of the fields are the help text of `sl-synth`."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path

@@ -296,7 +296,7 @@ def _bounced_vectors(stage: FrameGeometry, look: Look, centres: VisiblePoints) -
 
 
 def _small_lamps(stage: FrameGeometry, look: Look) -> SmallLamps:
-    """Where a coarse bundle of the projector's rays ends, and what is reflected there."""
+    """Small lamps where a coarse bundle of the projector's rays ends, with the light reflected there."""
     projector, origin = stage.devices.projector, stage.T_world_projector[:3, 3]
     place = (np.arange(_LAMPS_ACROSS) + 0.5) / _LAMPS_ACROSS
     uv = np.stack(np.meshgrid(place * projector.w, place * projector.h), -1).reshape(-1, 2)

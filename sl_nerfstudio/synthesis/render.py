@@ -1,4 +1,4 @@
-"""What a camera sees of a scene lit by a projector: surroundings, ray casting, correspondences, reflected light."""
+"""Rendering of a scene lit by a projector: surroundings, ray casting, correspondences, reflected light."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -143,7 +143,7 @@ class RayCaster:
         return (face >= 0) & (face < self._object_faces)
 
     def first_hits(self, origin: Float[ndarray, "3"], direction: Float[ndarray, "n 3"]) -> Hits:
-        """What unit rays from one place hit first.
+        """Find the first hits of unit rays from one place.
 
         open3d finds the face; the point on its plane is computed in double precision.
         """
@@ -178,7 +178,7 @@ class RayCaster:
 
 @dataclass(frozen=True)
 class FrameGeometry:
-    """What stands where in one frame."""
+    """Devices and surfaces of one frame, with their poses."""
 
     caster: RayCaster
     devices: DevicePair
@@ -242,7 +242,7 @@ def render_capture(
 
 
 def visible_centres(frame: FrameGeometry) -> VisiblePoints:
-    """What the rays through all pixel centres meet, row by row."""
+    """Trace the rays through all pixel centres, row by row."""
     camera = frame.devices.camera
     n, box = camera.w * camera.h, np.flatnonzero(_box_of_the_scene(frame))
     found = visible_points(frame, _corners(camera)[box] + 0.5)

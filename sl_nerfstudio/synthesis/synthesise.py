@@ -1,4 +1,4 @@
-"""From a configuration to files: a few frames at a time are rendered, disturbed and written."""
+"""Synthesis from a configuration to files: a few frames at a time are rendered, disturbed and written."""
 
 import json
 from collections.abc import Iterator
@@ -87,7 +87,7 @@ def random_stream(seed: int, stream: Stream, frame: int = 0) -> np.random.Genera
 
 @dataclass(frozen=True)
 class Photography:
-    """How the frames of a scan that is not plain are photographed."""
+    """Photography of the frames of a scan that is not plain."""
 
     look: Look
     shots: tuple[Shot, ...]
@@ -234,7 +234,7 @@ def synthesise(config: SynthConfig, output: Path) -> None:
 
 
 def without_noise(config: SynthConfig) -> SynthConfig:
-    """The same scan with exact coordinates, images and poses."""
+    """Make coordinates, images and poses exact."""
     return replace(
         config,
         noise=0.0,
@@ -357,7 +357,7 @@ def _add_files(writer: ScanWriter, config: SynthConfig, setup: Setup, truth: str
 
 
 def _captures_document(config: SynthConfig, setup: Setup) -> dict[str, Any]:
-    """Which frames are of use, and what the others lack."""
+    """Document which frames are of use, and what the others lack."""
     shots = [None] * config.frames if setup.photography is None else setup.photography.shots
     frames = [
         {

@@ -1,12 +1,9 @@
 """The classical baseline must be a fair one."""
 
-from pathlib import Path
-
-import numpy as np
 import pytest
 
 from benchmarks.baselines.poses import register
-from benchmarks.baselines.tsdf import backprojected, drop_islands, fuse, triangulated_depth
+from benchmarks.baselines.tsdf import fuse
 from sl_nerfstudio.evaluation.evaluate import score_alignments
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import compare_poses, mesh_reference
@@ -15,7 +12,6 @@ from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
-from tests.evaluation.faceted_scan import FacetedScan
 
 
 @pytest.fixture(scope="module")
@@ -34,27 +30,6 @@ def true_poses(scan: Scan) -> DevicePoses:
     poses = read_ground_truth(scan).poses
     assert poses is not None
     return poses
-
-
-def test_depth_maps_of_exact_coordinates_lie_on_the_truth(clean_scan: Path) -> None:
-    scan, truth = read_scan(clean_scan), IndexedMesh(FacetedScan().truth())
-    for frame in scan.frames:
-        depth = triangulated_depth(frame, scan, frame.T_world_camera, frame.T_world_projector)
-        points = backprojected(depth)
-        p_world = points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]
-        assert len(points) > 0.95 * frame.read_mask().sum()
-        assert truth.distance(p_world).max() < 1e-3
-
-
-def test_islands_are_dropped_and_slopes_kept() -> None:
-    depth = np.tile(np.linspace(100, 110, 60), (60, 1))
-    depth[:, 50:] = 0
-    depth[20:22, 20:22] = 130
-    depth[40, 55] = 105
-    kept = drop_islands(depth, 0.01)
-    assert (kept[20:22, 20:22] == 0).all() and kept[40, 55] == 0
-    depth[20:22, 20:22], depth[40, 55] = 0, 0
-    np.testing.assert_array_equal(kept, depth)
 
 
 def test_fusion_with_true_poses_is_as_good_as_its_voxels_and_registration_repairs_the_frames(disturbed: Scan) -> None:

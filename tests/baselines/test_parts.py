@@ -47,23 +47,16 @@ def test_depth_maps_are_those_of_an_ideal_pinhole(distorted: Scan) -> None:
     assert (depth.depth > 0).sum() == pytest.approx(frame.read_mask().sum(), rel=0.1)
 
 
-def test_windows_of_the_pattern_are_found_in_every_turn() -> None:
-    for turn in range(4):
-        mine = np.flatnonzero(PATTERN.turn == turn)
-        around = np.where(PATTERN.around[mine] < 0, -1, PATTERN.around[mine] - mine[0]).astype(np.int32)
-        found = match_windows(one_hot(PATTERN.symbol[mine]).numpy(), around, PATTERN, 0)
-        assert np.array_equal(found, mine)
-
-
-@given(st.integers(0, 2**31 - 1))
-def test_one_wrong_symbol_changes_nothing_but_random_symbols_match_nothing_reliably(seed: int) -> None:
+@given(st.integers(0, 2**31 - 1), st.integers(0, 3))
+def test_one_wrong_symbol_changes_nothing_but_random_symbols_match_nothing_reliably(seed: int, turn: int) -> None:
     rng = np.random.default_rng(seed)
-    mine = np.flatnonzero(PATTERN.turn == 0)
+    mine = np.flatnonzero(PATTERN.turn == turn)
+    around = np.where(PATTERN.around[mine] < 0, -1, PATTERN.around[mine] - mine[0]).astype(np.int32)
     symbol = PATTERN.symbol[mine].copy()
     wrong = int(rng.integers(len(mine)))
     symbol[wrong] = (symbol[wrong] + rng.integers(1, 5)) % 5
-    found = match_windows(one_hot(symbol).numpy(), PATTERN.around[mine], PATTERN, 1)
+    found = match_windows(one_hot(symbol).numpy(), around, PATTERN, 1)
     assert (found == mine).mean() > 0.98 and found[wrong] in (mine[wrong], -1)
     noise = rng.integers(0, 5, len(mine)).astype(symbol.dtype)
-    found = match_windows(one_hot(noise).numpy(), PATTERN.around[mine], PATTERN, 0)
+    found = match_windows(one_hot(noise).numpy(), around, PATTERN, 0)
     assert (found == -1).mean() > 0.8

@@ -77,6 +77,13 @@ def filmed_screen(monkeypatch, keyboard):
     return capture
 
 
+@pytest.fixture
+def in_step(command, filmed_screen, gray_pattern, tmp_path):
+    """Runs sl-capture with Gray code on the display and the camera in front of it."""
+    place = ("--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--settle", "0.001")
+    return lambda *flags: command(main, *place, *flags)
+
+
 def test_a_video_gives_one_frame_of_each_place(command, video, pattern, tmp_path, capsys):
     out = tmp_path / "my captures"
     command(main, "--camera", video, "--output", out, "--pattern", pattern, "--headless")
@@ -166,12 +173,11 @@ def test_the_grid_can_be_shown_by_the_same_command(command, keyboard, video, pat
     assert np.array_equal(screen[top : top + PATTERN.h, left : left + PATTERN.w, 0], image)
 
 
-def test_gray_code_is_shown_and_captured_in_step(command, keyboard, filmed_screen, gray_pattern, tmp_path, capsys):
-    flags = ["--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--headless"]
+def test_gray_code_is_shown_and_captured_in_step(in_step, keyboard, tmp_path, capsys):
     sequence = ["SPACE", *[""] * (GRAY.images + 1)]
     early = ["SPACE", "SPACE", ""]  # pressed while the first sequence is decoded
     keyboard.press("", *sequence, *early, *sequence)
-    command(main, *flags, "--settle", "0.001", "--rate", "100", "--frames", "2")
+    in_step("--headless", "--rate", "100", "--frames", "2")
     said = capsys.readouterr().out
     assert "Space captures the sequence of 18 images" in said and "kept frame_0001" in said and "warning" not in said
     assert re.search(r"all frames show 9\d %|all frames show (9\d|100)%", said)
@@ -185,9 +191,7 @@ def test_gray_code_is_shown_and_captured_in_step(command, keyboard, filmed_scree
     assert "sl-process --images" in said.strip().splitlines()[-1]
 
 
-def test_a_camera_that_changes_its_exposure_is_noticed(
-    command, keyboard, filmed_screen, gray_pattern, tmp_path, capsys
-):
+def test_a_camera_that_changes_its_exposure_is_noticed(in_step, keyboard, filmed_screen, capsys):
     steady = filmed_screen.take
 
     def brighter_and_brighter():
@@ -195,32 +199,24 @@ def test_a_camera_that_changes_its_exposure_is_noticed(
 
     filmed_screen.take = brighter_and_brighter
     keyboard.press("", "SPACE", *[""] * (GRAY.images + 1), "ESCAPE")
-    command(
-        main, "--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--headless",
-        "--settle", "0.001",
-    )  # fmt: skip
+    in_step("--headless")
     said = capsys.readouterr().out
     drift = int(re.search(r"white was (\d+)% brighter after the sequence", said)[1])
     assert 15 <= drift <= 26 and "kept frame_0000" in said and "give --exposure" in said
 
 
-def test_a_sequence_that_shows_nothing_is_not_kept(command, keyboard, filmed_screen, gray_pattern, tmp_path, capsys):
+def test_a_sequence_that_shows_nothing_is_not_kept(in_step, keyboard, filmed_screen, tmp_path, capsys):
     filmed_screen.take = lambda: np.zeros((*WALL[::-1], 3), dtype=np.uint8)  # a lens cap
     keyboard.press("", "SPACE", *[""] * (GRAY.images + 1), "ESCAPE")
-    command(
-        main, "--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--headless",
-        "--settle", "0.001",
-    )  # fmt: skip
+    in_step("--headless")
     said = capsys.readouterr().out
     assert "not kept: this sequence no stripes are seen: the images are black" in said
     assert "no frame was kept" in said and not (tmp_path / "c").exists()
 
 
-def test_escape_leaves_a_sequence_that_is_under_way(command, keyboard, filmed_screen, gray_pattern, tmp_path):
+def test_escape_leaves_a_sequence_that_is_under_way(in_step, keyboard, tmp_path):
     keyboard.press("", "SPACE", "", "", "ESCAPE")
-    command(
-        main, "--camera", 0, "--output", tmp_path / "c", "--pattern", gray_pattern, "--show", 0, "--settle", "0.001"
-    )
+    in_step()
     assert not (tmp_path / "c").exists()
 
 
@@ -257,9 +253,6 @@ def test_control_c_is_a_usual_end(command, video, pattern, tmp_path, capsys, mon
     ],
 )
 def test_bad_flags(command, keyboard, filmed_screen, gray_pattern, video, pattern, tmp_path, capsys, flags, message):
-    if flags[1] != "0":
-        monkey = pytest.MonkeyPatch()
-        monkey.undo()
     words = {"VIDEO": video, "PATTERN": pattern, "GRAY": gray_pattern}
     with pytest.raises(SystemExit) as stop:
         command(main, *(words.get(flag, flag) for flag in flags), "--output", tmp_path / "c")

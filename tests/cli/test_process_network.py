@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.cli import process, synth
-from sl_nerfstudio.geometry.lie import fit_similarity
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import read_image
+from tests.formulas import pose_errors
 
 pytestmark = pytest.mark.slow
 
@@ -62,12 +62,9 @@ def test_poses_are_true_but_for_a_rigid_motion(folder):
     scan, true = read_scan(folder / "scan"), _true_frames(folder)
     found = scan.poses.stacked()
     wanted = np.stack([f.T_world_camera for f in true] + [f.T_world_projector for f in true])
-    S = fit_similarity(found[:, :3, 3], wanted[:, :3, 3])
+    S, degrees, off = pose_errors(found, wanted)
     distance = np.linalg.norm(wanted[:KEPT, :3, 3] - _middle(folder), axis=1).mean()
-    off = np.linalg.norm(S.points(found[:, :3, 3]) - wanted[:, :3, 3], axis=1)
     assert off.max() < 0.004 * distance  # measured: 0.001
-    turned = S.poses(found)[:, :3, :3] @ wanted[:, :3, :3].transpose(0, 2, 1)
-    degrees = np.degrees(np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1)))
     assert degrees.max() < 0.4  # measured: 0.14
     assert scan.units == "mm" and S.scale == pytest.approx(1, abs=0.01)
 

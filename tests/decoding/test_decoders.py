@@ -7,13 +7,11 @@ import pytest
 
 from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.decoders import DECODERS, GrayCodeDecoder, choose_decoder
-from sl_nerfstudio.decoding.gray_code import decode_gray_code
 from sl_nerfstudio.decoding.grid import GridImageDecoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import LAYOUTS
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.images import encode_png
 from tests.decoding.gray_captures import LAYOUT, exact_coords, photographs
 from tests.decoding.ramps_decoder import RampsDecoder
@@ -54,13 +52,6 @@ def test_a_decoder_that_does_not_suit_is_refused(tmp_path, layout, name, message
     assert "cause:" in str(caught.value) and "remedy:" in str(caught.value)
 
 
-def test_a_new_decoder_is_one_entry(monkeypatch, tmp_path):
-    monkeypatch.setitem(DECODERS, "ramps", RampsDecoder)
-    assert isinstance(choose_decoder(Ramps(4, 3), None, tmp_path), RampsDecoder)
-    assert isinstance(choose_decoder(Ramps(4, 3), "ramps", tmp_path), RampsDecoder)
-    assert choose_decoder(GRID, None, tmp_path).name == "network"
-
-
 def test_of_two_decoders_of_one_pattern_the_first_is_the_default_and_the_other_can_be_named(monkeypatch, tmp_path):
     class Other(DECODERS["graycode"]):
         name = "other"
@@ -88,14 +79,6 @@ def test_the_key_changes_with_everything_that_changes_results(monkeypatch, tmp_p
     assert len({first, second, third, fourth, key()}) == 5
 
 
-def test_the_network_decoder_depends_on_all_that_was_trained():
-    assert [path.name for path in DECODERS["network"](GRID).weights()] == [
-        "edges.safetensors",
-        "gcn.safetensors",
-        "unet.safetensors",
-    ]
-
-
 def test_creating_a_decoder_loads_no_network_and_it_can_be_sent_to_another_process(monkeypatch):
     def load(*_):
         raise AssertionError("a network was loaded")
@@ -116,27 +99,6 @@ def test_the_network_decoder_reads_the_one_image_of_a_frame(tmp_path):
     x, y = np.meshgrid(np.arange(280) + 60.5, np.arange(260) + 40.5)
     error = np.linalg.norm(found.coords - np.stack([x, y], -1), axis=-1)[10:-10, 10:-10]
     assert np.isfinite(error).mean() > 0.95 and np.nanmax(error) < 1 and np.nanmedian(error) < 0.1
-
-
-def test_the_gray_code_decoder_reads_a_sequence_in_order(tmp_path):
-    images = photographs(exact_coords())
-    paths = write_images(tmp_path, images)
-    found, expected = DECODERS["graycode"](LAYOUT).decode(paths), decode_gray_code(images, LAYOUT)
-    np.testing.assert_array_equal(found.coords, expected.coords)
-
-
-def test_images_are_counted_before_they_are_read(tmp_path):
-    with pytest.raises(DecodingError, match="holds 3 images, the sequence of the pattern has 18"):
-        DECODERS["graycode"](GRAY).decode([tmp_path / "missing.png"] * 3)
-
-
-@pytest.mark.parametrize(("name", "layout", "count"), [("network", GRID, 1), ("graycode", GRAY, GRAY.images)])
-def test_a_broken_file_is_named(tmp_path, name, layout, count):
-    paths = [tmp_path / f"{k}.png" for k in range(count)]
-    for path in paths:
-        path.write_bytes(b"no image")
-    with pytest.raises(FileError, match=r"0\.png"):
-        DECODERS[name](layout).decode(paths)
 
 
 def test_a_stated_order_is_believed_unless_the_images_show_another(tmp_path):

@@ -82,15 +82,6 @@ def test_noise_costs_pixels_but_makes_few_wrong_ones():
     assert (np.linalg.norm(decoded.coords[both] - COORDS[both], axis=1) > 2 * LAYOUT.cell).mean() < 5e-3
 
 
-def test_cells_smaller_than_a_pixel_of_the_camera_take_the_mean_of_cells():
-    coords = exact_coords(100, 75) * 1.0
-    layout = GrayCode(320, 240, 1)
-    decoded = decode_gray_code(photographs(coords, layout=layout, blur=0.3), layout)
-    both = decoded.decoded & np.isfinite(coords).all(-1)
-    assert both.sum() > 0.5 * np.isfinite(coords).all(-1).sum()
-    assert np.median(np.abs(decoded.coords[both] - coords[both])) < 0.4
-
-
 @pytest.mark.parametrize(
     ("light", "size", "note", "largest_error"),
     [

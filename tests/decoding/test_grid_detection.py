@@ -4,30 +4,23 @@ import cv2
 import numpy as np
 import pytest
 
-from benchmarks.baselines.window_matching import match_windows
 from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.grid import GridImageDecoder
 from sl_nerfstudio.decoding.grid_detection import (
-    MIRRORED_SYMBOL,
     NodeRecogniser,
     edge_width,
     line_blur,
     measure_exposure,
     measure_noise,
-    mirrored,
     shows_readable_symbols,
 )
 from sl_nerfstudio.decoding.grid_graph import (
-    OFFSETS,
     GridGraph,
     agree,
     believe,
-    neighbourhoods,
-    one_hot,
-    turned_pattern,
 )
 from sl_nerfstudio.decoding.grid_phases import GridAppearance, rectify
-from sl_nerfstudio.pattern.codes import code_array, rotate_codes
+from sl_nerfstudio.pattern.codes import code_array
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import disturb_image
@@ -50,19 +43,6 @@ def graphs(damage, count=6):
         yield damage_graph(rng, CODES, damage, index % 4, 0.5)
 
 
-def test_turned_pattern_lists_every_node_of_every_turn():
-    pattern = turned_pattern(CODES)
-    assert len(pattern.symbol) == 4 * CODES.size
-    for turn in range(4):
-        mine = pattern.turn == turn
-        turned = rotate_codes(CODES, turn)
-        assert (pattern.symbol[mine] == turned[tuple(pattern.place[mine].T)]).all()
-        for k, (di, dj) in enumerate(OFFSETS):
-            around = pattern.around[mine, k]
-            assert (pattern.place[around[around >= 0]] == pattern.place[mine][around >= 0] + (di, dj)).all()
-            assert (pattern.turn[around[around >= 0]] == turn).all()
-
-
 @pytest.mark.parametrize(
     "damage, most_wrong",
     [
@@ -81,37 +61,6 @@ def test_nearly_every_node_finds_its_place_and_hardly_any_a_wrong_one(recogniser
         right, total = right + same.sum(), total + len(same)
         wrong += (~same & assignment.known).sum()
     assert right > 0.93 * total and wrong <= most_wrong * total
-
-
-def test_the_graph_network_beats_window_matching_on_damaged_graphs(recogniser):
-    pattern = turned_pattern(CODES)
-    for misread in (0.1, 0.2, 0.3):
-        network = windows = total = 0
-        for graph in graphs(Damage(misread, 0.2)):
-            around = neighbourhoods(graph.neighbour)
-            judged = recogniser.logits(graph.as_grid()).argmax(1).numpy()
-            true = (pattern.turn == graph.turn) & (pattern.place[:, None] == graph.place).all(-1).T  # node, candidate
-            rows = np.arange(len(graph.place))
-            network += true[rows, judged].sum()
-            matched = match_windows(graph.score, around, pattern)
-            windows += (true[rows, matched] & (matched >= 0)).sum()
-            total += len(rows)
-        assert network > windows + 0.1 * total
-
-
-def test_window_matching_corrects_one_symbol_and_is_certain_without_damage():
-    pattern = turned_pattern(CODES)
-    rng = np.random.default_rng(0)
-    graph = damage_graph(rng, CODES, Damage(0, 0, 0), 1, 1.0)
-    around = neighbourhoods(graph.neighbour)
-    score = one_hot(rotate_codes(CODES, 1)[tuple(graph.place.T)]).numpy()
-    hurt = score.copy()
-    hurt[100] = np.roll(hurt[100], 1)
-    for scores in (score, hurt):
-        matched = match_windows(scores, around, pattern)
-        assert (matched >= 0).mean() > 0.99
-        assert (pattern.place[matched[matched >= 0]] == graph.place[matched >= 0]).all()
-        assert (pattern.turn[matched[matched >= 0]] == 1).all()
 
 
 def test_small_pieces_that_fit_several_places_are_dropped():
@@ -262,25 +211,6 @@ def test_the_blur_of_lines_is_measured(sigma):
     vector = maps.vector * np.cos(shift[0])
     measured = line_blur(rectified, type(maps)(maps.mask, vector, maps.symbol, maps.gradient), maps.mask > 0, pattern)
     assert measured == pytest.approx(sigma, abs=0.03)
-
-
-def test_a_mirrored_grid_has_mirrored_symbols():
-    codes = np.random.default_rng(0).integers(0, 5, (12, 12)).astype(np.int8)
-    swapped = np.array(MIRRORED_SYMBOL, dtype=np.int8)[codes[:, ::-1]]
-    one, two = (GridPattern(w=240, h=240, codes=c).render() for c in (codes, swapped))
-    np.testing.assert_allclose(one[:, ::-1], two, atol=1e-5)
-
-
-def test_mirroring_twice_changes_nothing():
-    _, cells, neighbour = lattice(4, 5)
-    score = np.random.default_rng(0).random((len(cells), 5)).astype(np.float32)
-    graph = GridGraph(np.array(cells, dtype=np.float32)[:, ::-1], neighbour, score)
-    once, twice = mirrored(graph), mirrored(mirrored(graph))
-    assert not np.array_equal(once.neighbour, graph.neighbour)
-    for a, b in zip(
-        (twice.place, twice.neighbour, twice.score), (graph.place, graph.neighbour, graph.score), strict=True
-    ):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_symbols_are_readable_only_in_a_consistent_grid_of_all_five():

@@ -11,6 +11,7 @@ from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.files import write_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Scale, ScanWriter
+from tests.formulas import look_at, pixels, rays
 
 from .shapes import blob, turn
 
@@ -82,24 +83,17 @@ class FacetedScan:
 
     def observe(self, T_camera: ndarray, T_projector: ndarray) -> tuple[ndarray, ndarray]:
         """Mask, and pattern coordinates where the mask is set (NaN elsewhere)."""
-        column, row = np.meshgrid(np.arange(CAMERA.w) + 0.5, np.arange(CAMERA.h) + 0.5)
-        d = np.stack([(column - CAMERA.cx) / CAMERA.fl_x, -(row - CAMERA.cy) / CAMERA.fl_y, -np.ones_like(row)], -1)
-        d = (d @ T_camera[:3, :3].T).reshape(-1, 3)
+        eye, d = rays(CAMERA, T_camera)
+        shape, d = d.shape[:2], d.reshape(-1, 3)
         truth = self.truth()
-        t = first_hit(truth, T_camera[:3, 3], d)
-        p = T_camera[:3, 3] + np.where(np.isfinite(t), t, 0)[:, None] * d
-        uv = project_plainly(self.projector, (p - T_projector[:3, 3]) @ T_projector[:3, :3])
+        t = first_hit(truth, eye, d)
+        p = eye + np.where(np.isfinite(t), t, 0)[:, None] * d
+        uv = pixels(self.projector, T_projector, p)
         back = p - T_projector[:3, 3]
         lit = np.isfinite(t) & (first_hit(truth, T_projector[:3, 3], back) > 1 - 1e-9)
         lit &= ((uv >= 0) & (uv < [self.projector.w, self.projector.h])).all(1)
         uv[~lit] = np.nan
-        return lit.reshape(row.shape), uv.reshape(*row.shape, 2)
-
-
-def project_plainly(device: Device, p: ndarray) -> ndarray:
-    """The scan format's formulas, written out (no distortion)."""
-    depth = np.linalg.norm(p, axis=1) if device.model == "DOE" else -p[:, 2]
-    return np.stack([device.fl_x * p[:, 0] / depth + device.cx, -device.fl_y * p[:, 1] / depth + device.cy], 1)
+        return lit.reshape(shape), uv.reshape(*shape, 2)
 
 
 def first_hit(mesh: Mesh, origin: ndarray, directions: ndarray) -> ndarray:
@@ -120,13 +114,9 @@ def first_hit(mesh: Mesh, origin: ndarray, directions: ndarray) -> ndarray:
 
 def looking_at_origin(distance: float, angle: float, height: float) -> ndarray:
     """Pose of a device on a sphere about the origin, z up, looking at it."""
-    back = np.array([np.cos(angle) * np.cos(height), np.sin(angle) * np.cos(height), np.sin(height)])
-    right = np.cross([0, 0, 1.0], back)
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(back, right), back], 1)
-    T[:3, 3] = distance * back
-    return T
+    return look_at(
+        distance * np.array([np.cos(angle) * np.cos(height), np.sin(angle) * np.cos(height), np.sin(height)])
+    )
 
 
 def dots(device: Device) -> ndarray:

@@ -21,6 +21,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import read_scan
+from tests.formulas import rays
 
 from .faceted_scan import FacetedScan
 from .shapes import blob, turn
@@ -170,11 +171,8 @@ def test_a_hole_is_as_large_as_the_pixels_that_saw_what_is_missing(fine_scan: Pa
 def rays_of(root: Path, pixels: FramePixels) -> tuple[np.ndarray, np.ndarray]:
     """Camera rays by the pinhole's formula."""
     frame = read_scan(root).frames[0]
-    c = frame.camera
-    x, y = (pixels.column + 0.5 - c.cx) / c.fl_x, -(pixels.row + 0.5 - c.cy) / c.fl_y
-    d = np.stack([x, y, -np.ones_like(x)], -1)
-    d = d / np.linalg.norm(d, axis=1, keepdims=True) @ frame.T_world_camera[:3, :3].T
-    return np.broadcast_to(frame.T_world_camera[:3, 3], d.shape), d
+    eye, d = rays(frame.camera, frame.T_world_camera, np.stack([pixels.column, pixels.row], 1) + 0.5)
+    return np.broadcast_to(eye, d.shape), d
 
 
 def test_a_patch_that_was_mistaken_for_another_is_no_hole(fine_scan: Path) -> None:

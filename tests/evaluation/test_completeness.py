@@ -17,6 +17,7 @@ from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
+from tests.formulas import look_at
 
 from .shapes import sphere
 
@@ -60,20 +61,13 @@ DEVICE = Device(w=300, h=300, fl_x=500.0, fl_y=500.0, cx=150.0, cy=150.0)
 DISTANCE = 5.0
 
 
-def looking_at_origin(direction: np.ndarray) -> np.ndarray:
-    z = np.asarray(direction, float) / np.linalg.norm(direction)
-    x = np.cross([0, 0, 1.0], z)
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = np.stack([x, np.cross(z, x), z], 1), DISTANCE * z
-    return T
-
-
 def poses(angles_deg: np.ndarray, elevation: float) -> DevicePoses:
     """Cameras at some angles around the axis, each with its projector 12 degrees to the side."""
     ring = [(np.cos(a), np.sin(a), elevation) for a in np.radians(angles_deg)]
     beside = [(np.cos(a), np.sin(a), elevation) for a in np.radians(np.asarray(angles_deg) + 12)]
-    return DevicePoses(*(np.stack([looking_at_origin(d) for d in way]) for way in (ring, beside)))
+    return DevicePoses(
+        *(np.stack([look_at(DISTANCE * np.array(d) / np.linalg.norm(d)) for d in way]) for way in (ring, beside))
+    )
 
 
 def proposed(mesh: Mesh, devices: DevicePoses) -> NextView:

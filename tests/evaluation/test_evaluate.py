@@ -28,6 +28,7 @@ from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 from sl_nerfstudio.meshing.uncertainty import point_changes, views_by_frame
 from sl_nerfstudio.scan import Scan, read_scan
+from tests import formulas
 
 from .faceted_scan import FacetedScan
 from .shapes import blob, known_similarity, sphere, turn
@@ -253,21 +254,9 @@ def quality() -> VertexQuality:
     return VertexQuality(np.full(count, 0.05), np.full(count, 0.03), views, np.zeros(count), np.zeros(count))
 
 
-def test_points_move_with_all_poses_and_lengths_grow_with_them(scan, rows):
-    chosen, found, _ = rows
-    p = FacetedScan().truth().vertices[chosen]
-    v, w = np.array([1.0, -2.0, 0.5]), np.array([0.3, 0.1, -0.2])
-    motion = np.r_[np.tile(np.r_[v, w], FRAMES), np.zeros(6 * FRAMES + 6)]
-    np.testing.assert_allclose(found @ motion, v + np.cross(w, p), rtol=1e-7, atol=1e-7)
-    growth = np.zeros((2, FRAMES, 6))
-    growth[0, :, :3] = scan.poses.T_world_camera[:, :3, 3]
-    growth[1, :, :3] = scan.poses.T_camera_projector[:, :3, 3]
-    np.testing.assert_allclose(found @ np.r_[growth.ravel(), np.zeros(6)], p, rtol=1e-6, atol=1e-6)
-
-
 def test_a_point_is_where_the_rays_of_all_its_pixels_meet_best(scan, rows):
     """With disturbed poses, least squares on the plain pinhole formulas, from the pixels under the true ones."""
-    from .faceted_scan import CAMERA, PROJECTOR, project_plainly
+    from .faceted_scan import CAMERA, PROJECTOR
 
     chosen, found, seen = rows
     row = int(seen.sum(1).argmax())
@@ -281,7 +270,7 @@ def test_a_point_is_where_the_rays_of_all_its_pixels_meet_best(scan, rows):
             camera = delta[k] @ scan.poses.T_world_camera[k]
             light = camera @ rho[k] @ scan.poses.T_camera_projector[k]
             for device, T in ((CAMERA, camera), (PROJECTOR, light)):
-                out.append(project_plainly(device, ((at - T[:3, 3]) @ T[:3, :3])[None])[0])
+                out.append(formulas.pixels(device, T, at))
         return np.concatenate(out)
 
     decoded, ends = pixels(p, 0.0), []

@@ -8,7 +8,7 @@ import pytest
 from sl_nerfstudio.decoding.grid_fit import draw_sharpnesses
 from sl_nerfstudio.matching import matcher
 from sl_nerfstudio.matching.costs import StereoMatches
-from sl_nerfstudio.matching.matcher import FEATURES, RIGHT, DecodedImage, LineFit, LineMatcher, Logistic, features_of
+from sl_nerfstudio.matching.matcher import FEATURES, RIGHT, DecodedImage, LineFit, LineMatcher, features_of
 from tests.matching.scene import PATTERN, PERIOD, across, step_scene
 
 SIZE = 200 / 15
@@ -205,10 +205,3 @@ def test_a_match_at_the_decoded_place_far_from_jumps_is_right_and_a_lonely_one_b
     wild = StereoMatches(index, np.full((40, 50), 90, np.uint8), matches.margin * 0)
     nowhere = np.full_like(coords, np.nan)
     assert RIGHT.probability(features(wild, coords * 20, nowhere, np.zeros((40, 50), bool))).max() < 0.2
-
-
-def test_the_probability_is_logistic():
-    weights = np.arange(1.0, COUNT + 1) / 10
-    x = np.random.default_rng(1).normal(size=(3, 4, COUNT)).astype(np.float32)
-    expected = 1 / (1 + np.exp(-(0.3 + (x * weights).sum(-1))))
-    np.testing.assert_allclose(Logistic(0.3, tuple(weights)).probability(x), expected, rtol=1e-5)

@@ -11,6 +11,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.scan.images import encode_png
+from tests.formulas import on_ball, rays
 
 from .ray_cast_scan import pairs_around, scan_of
 
@@ -28,14 +29,8 @@ def colour_at(p: np.ndarray) -> np.ndarray:
 
 def picture(T_world_camera: np.ndarray, camera: Device = PINHOLE, colour: Colour = colour_at) -> np.ndarray:
     """What a pinhole camera sees of the ball, by the formulas of the format; black beside it."""
-    x, y = np.meshgrid(np.arange(camera.w) + 0.5, np.arange(camera.h) + 0.5)
-    d = np.stack([(x - camera.cx) / camera.fl_x, -(y - camera.cy) / camera.fl_y, -np.ones_like(x)], -1)
-    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ T_world_camera[:3, :3].T
-    o = T_world_camera[:3, 3]
-    b, c = d @ o, o @ o - RADIUS**2
-    hit = b * b > c
-    p = o + (-b - np.sqrt(np.where(hit, b * b - c, 0)))[..., None] * d
-    return np.round(np.where(hit[..., None], colour(p), 0.0) * 255).astype(np.uint8)
+    p = on_ball(*rays(camera, T_world_camera), RADIUS)
+    return np.round(np.nan_to_num(colour(p)) * 255).astype(np.uint8)
 
 
 def coloured_scan(root: Path, pictures: int, camera: Device = PINHOLE, colour: Colour = colour_at) -> Scan:

@@ -1,6 +1,6 @@
 """Scans of a mesh made with nothing but the formulas of the scan format: the truth for trimming."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,28 +10,12 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.scan import (
-    Frame,
-    Scale,
-    Scan,
-    ScanWriter,
-)
+from sl_nerfstudio.scan import Frame, Scale, Scan, ScanWriter
+from tests.formulas import look_at, pixels, rays
 
 CAMERA = Device(w=96, h=96, fl_x=160.0, fl_y=160.0, cx=48.0, cy=48.0)
 PROJECTOR = Device(w=400, h=400, fl_x=800.0, fl_y=800.0, cx=200.0, cy=200.0)
 Change = Callable[[int, Float[ndarray, "h w 2"]], Float[ndarray, "h w 2"]]
-
-
-def look_at(eye: Sequence[float], target: Sequence[float] = (0.0, 0.0, 0.0)) -> Float[ndarray, "4 4"]:
-    """Pose of a device at `eye` that looks along its -z at `target`, +y as far up (world z) as it can."""
-    back = np.subtract(eye, target).astype(float)
-    back /= np.linalg.norm(back)
-    right = np.cross([0.0, 0.0, 1.0] if abs(back[2]) < 0.99 else [0.0, 1.0, 0.0], back)
-    right /= np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(back, right), back], 1)
-    T[:3, 3] = eye
-    return T
 
 
 def pairs_around(
@@ -86,22 +70,16 @@ def captured(
     scene.add_triangles(
         o3d.core.Tensor(truth.vertices.astype(np.float32)), o3d.core.Tensor(truth.faces.astype(np.uint32))
     )
-    y, x = np.mgrid[: camera.h, : camera.w] + 0.5
-    direction = (
-        np.stack([(x - camera.cx) / camera.fl_x, -(y - camera.cy) / camera.fl_y, -np.ones_like(x)], -1)
-        @ T_camera[:3, :3].T
-    )
-    origin = np.broadcast_to(T_camera[:3, 3], direction.shape)
+    eye, direction = rays(camera, T_camera)
+    origin = np.broadcast_to(eye, direction.shape)
     depth = _cast(scene, origin, direction)
     hit = np.isfinite(depth)
     p_world = origin + np.where(hit, depth, 1.0)[..., None] * direction
-    p: ndarray = (p_world - T_projector[:3, 3]) @ T_projector[:3, :3]
-    u = PROJECTOR.fl_x * p[..., 0] / -p[..., 2] + PROJECTOR.cx
-    v = -PROJECTOR.fl_y * p[..., 1] / -p[..., 2] + PROJECTOR.cy
+    uv = pixels(PROJECTOR, T_projector, p_world)
     light = T_projector[:3, 3] - p_world
     lit = ~np.isfinite(_cast(scene, p_world + 1e-3 * light, light))
-    mask = hit & lit & (u >= 0) & (u < PROJECTOR.w) & (v >= 0) & (v < PROJECTOR.h)
-    return np.where(mask[..., None], np.stack([u, v], -1), np.nan).astype(np.float32), mask
+    mask = hit & lit & (uv >= 0).all(-1) & (uv < (PROJECTOR.w, PROJECTOR.h)).all(-1)
+    return np.where(mask[..., None], uv, np.nan).astype(np.float32), mask
 
 
 def _cast(scene: o3d.t.geometry.RaycastingScene, origin: ndarray, direction: ndarray) -> ndarray:

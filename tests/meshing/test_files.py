@@ -97,24 +97,39 @@ def ply(vertices: str, faces: str, n_vertices: int, n_faces: int) -> str:
     )
 
 
+THREE, FACE = "0 0 0\n1 0 0\n0 1 0\n", "3 0 1 2\n"
+OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+
+
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("suffix", "content", "message"),
     [
-        (ply("0 0 0\n1 0 0\n0 1 0\n", "", 3, 0), r"has no triangles: it holds 3 points only(.|\n)*point cloud"),
-        (
-            ply("0 0 0\n1 0 nan\n0 1 0\n", "3 0 1 2\n", 3, 1),
-            r"has 1 vertices that are not numbers, the first is number 1",
-        ),
-        (ply("0 0 0\n1 0 0\n0 1e30 0\n", "3 0 1 2\n", 3, 1), r"reaches out to 1e\+30 units"),
-        (ply("0 0 0\n1 0 0\n0 1 0\n", "3 0 1 7\n", 3, 1), r"triangles at vertices that do not exist|cannot be read"),
-        (ply("0 0 0\n1 0 0\n0 1 0\n", "3 0 1 2\n", 4_000_000_000, 1), r"should hold 4000000000 vertices"),
-        (ply("0 0 0\n1 0 0\n0 1 0\n", "3 0 1 2\n", 3, 2), r"should hold 3 vertices and 2 faces, but 3 and 1 were read"),
+        ("ply", ply(THREE, "", 3, 0), r"has no triangles: it holds 3 points only(.|\n)*point cloud"),
+        ("ply", ply("0 0 0\n1 0 nan\n0 1 0\n", FACE, 3, 1), r"1 vertices that are not numbers, the first is number 1"),
+        ("ply", ply("inf 0 0\n1 0 0\n0 1 0\n", FACE, 3, 1), r"1 vertices that are not numbers, the first is number 0"),
+        ("ply", ply("0 0 0\n1 0 0\n0 1e30 0\n", FACE, 3, 1), r"reaches out to 1e\+30 units"),
+        ("ply", ply(THREE, "3 0 1 7\n", 3, 1), r"triangles at vertices that do not exist|cannot be read"),
+        ("ply", ply(THREE, "3 0 1 -1\n", 3, 1), r"triangles at vertices that do not exist"),
+        ("ply", ply(THREE, FACE, 4_000_000_000, 1), r"should hold 4000000000 vertices"),
+        ("ply", ply(THREE, FACE, 3, 10**9), r"should hold 3 vertices and 1000000000 faces, but 3 and 1 were read"),
+        ("ply", ply(THREE, FACE, -3, 1), r"should hold 0 vertices"),
+        ("ply", ply(THREE, "2 0 1\n", 3, 1), r"should hold 3 vertices and 1 faces, but 3 and 0 were read"),
+        ("ply", ply("0 0 0\n" * 3, FACE, 3, 1), r"has no triangle with an area"),
+        ("ply", "ply\nformat ascii 1.0\nend_header\n", r"has no triangles: it holds nothing"),
+        ("obj", OBJ, r"has no triangles: it holds 3 points only"),
+        ("obj", OBJ + "f 1 2 9\n", r"cannot be read as OBJ"),
+        ("obj", "v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n", r"has vertices that are not three numbers each"),
+        ("obj", "v a b c\nf 1 2 3\n", r"cannot be read as OBJ"),
+        ("stl", "\0" * 80 + "\xff\xff\xff\x7f" + "\0" * 50, r"has no triangles"),
+        ("stl", "solid x\nfacet normal a b c\n", r"has no triangles"),
+        ("glb", "glTF\2\0\0\0\0\0\0\x7f\xff\xff\xff\x7fJSON", r"cannot be read as GLB"),
     ],
 )
-def test_contents_that_are_no_mesh(content, message, tmp_path):
-    (tmp_path / "m.ply").write_text(content)
-    with pytest.raises(UserError, match=message):
-        read_mesh(tmp_path / "m.ply")
+def test_contents_that_are_no_mesh(suffix, content, message, tmp_path):
+    path = tmp_path / f"m.{suffix}"
+    path.write_bytes(content.encode("latin-1"))
+    with pytest.raises(UserError, match=rf"m\.{suffix}: (.|\n)*{message}"):
+        read_mesh(path)
 
 
 def test_polygons_and_several_parts_are_read(tmp_path):

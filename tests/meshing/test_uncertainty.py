@@ -256,19 +256,6 @@ def test_noise_and_its_independence_are_measured_from_the_scan(views: list[Frame
     assert 1 <= sums.correlation < 1.4
 
 
-def test_the_surface_moves_with_all_poses_and_grows_with_them(scan: Scan, views: list[FrameViews]):
-    vertices, rows = rows_of(scan, views)
-    mesh = hill()
-    p, n = mesh.vertices[vertices], mesh.vertex_normals()[vertices]
-    motion = np.random.default_rng(2).normal(size=6)
-    all_frames = np.r_[np.tile(motion, FRAMES), np.zeros(6 * FRAMES + 6)]
-    np.testing.assert_allclose(rows @ all_frames, ((motion[:3] + np.cross(motion[3:], p)) * n).sum(1), rtol=1e-9)
-    growth = np.zeros((2, FRAMES, 6))
-    growth[0, :, :3] = scan.poses.T_world_camera[:, :3, 3]
-    growth[1, :, :3] = scan.poses.T_camera_projector[:, :3, 3]
-    np.testing.assert_allclose(rows @ np.r_[growth.ravel(), np.zeros(6)], (p * n).sum(1), rtol=1e-8, atol=1e-8)
-
-
 def moved(scan: Scan, step: np.ndarray) -> DevicePoses:
     """Poses with (delta, rho) of all frames."""
     delta, rho = torch.from_numpy(step[: 12 * FRAMES]).reshape(2, FRAMES, 6)
@@ -370,9 +357,3 @@ def test_vertices_that_no_frame_confirms_are_marked(scan: Scan):
     seen = found.views > 0
     assert (found.sigma[seen] > found.sigma_independent[seen]).all() and (found.sigma_independent[seen] > 0).all()
     assert np.nanmin(found.ray_angle) > 8 and np.nanmax(found.ray_angle) < 12  # 20 degrees apart, 60 degrees up
-
-
-def test_of_a_mesh_that_no_frame_sees_nothing_is_stated(scan: Scan):
-    away = hill().mapped(Similarity(1.0, np.eye(3), np.array([500.0, 0.0, 0.0])))
-    found = vertex_uncertainty(away, scan, scan.poses, random_joint(), CELL)
-    assert (found.views == 0).all() and np.isnan(found.sigma).all()

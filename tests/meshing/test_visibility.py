@@ -29,6 +29,7 @@ from sl_nerfstudio.meshing.visibility import (
     visible_vertices,
 )
 from sl_nerfstudio.scan import Scan
+from tests.formulas import pixels
 
 from .ray_cast_scan import CAMERA, PROJECTOR, look_at, pairs_around, scan_of
 
@@ -42,11 +43,6 @@ def plate(half: float, cell: float, z: float = 0.0) -> Mesh:
     i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1, 1)
     faces = np.concatenate([i + np.array([0, 1, n]), i + np.array([1, n + 1, n])])
     return Mesh(np.stack([x.ravel(), y.ravel(), np.full(n * n, z)], 1), faces)
-
-
-def pixels(points: np.ndarray, T: np.ndarray) -> np.ndarray:
-    p = (points - T[:3, 3]) @ T[:3, :3]
-    return np.stack([CAMERA.cx - CAMERA.fl_x * p[:, 0] / p[:, 2], CAMERA.cy + CAMERA.fl_y * p[:, 1] / p[:, 2]], 1)
 
 
 @pytest.fixture(scope="module")
@@ -73,15 +69,11 @@ def test_every_vertex_of_the_true_plate_is_seen_and_predicted_exactly(scan):
 def test_a_surface_at_another_height_is_predicted_wrong_by_the_parallax(scan):
     lifted = plate(20.0, 2.0, z=6.0)
     view = seen(lifted, scan)
-    u, _ = pixels(lifted.vertices, POSES[0]), None
-    assert len(u) == len(view.vertex)
+    assert len(view.vertex) == len(lifted.vertices)
     # what is decoded there lies on z = 0, behind the vertex on its camera ray
     eye = POSES[0][:3, 3]
     behind = eye + (lifted.vertices - eye) * (eye[2] / (eye[2] - 6.0))
-    both = []
-    for points in (lifted.vertices, behind):
-        p = (points - POSES[1][:3, 3]) @ POSES[1][:3, :3]
-        both.append(PROJECTOR.fl_x * np.stack([-p[:, 0], p[:, 1]], 1) / p[:, 2:])
+    both = [pixels(PROJECTOR, POSES[1], points) for points in (lifted.vertices, behind)]
     expected = np.linalg.norm(both[0] - both[1], axis=1)
     np.testing.assert_allclose(view.most, expected, rtol=0.02)
     assert expected.min() > LEAST_PX and (view.least > LEAST_PX).all()
@@ -91,8 +83,8 @@ def test_outside_the_mask_the_distance_in_pixels_decides(scan):
     """The mesh goes on beyond the true plate."""
     mesh = plate(45.0, 1.0)
     view = seen(mesh, scan)
-    corners = pixels(plate(30.0, 60.0).vertices, POSES[0])
-    points = pixels(mesh.vertices[view.vertex], POSES[0])
+    corners = pixels(CAMERA, POSES[0], plate(30.0, 60.0).vertices)
+    points = pixels(CAMERA, POSES[0], mesh.vertices[view.vertex])
     outside = distance_from_quadrilateral(points, corners[[0, 1, 3, 2]])
     assert view.off_mask[outside > 1.5 * OFF_MASK_PX + 1.5].all()  # a square of pixels grows to its corners
     assert not view.off_mask[outside < OFF_MASK_PX - 1.5].any()
@@ -197,7 +189,7 @@ def bounds(coords: ndarray, uv: ndarray, J: ndarray) -> tuple[ndarray, ndarray]:
 @pytest.mark.parametrize("devices", [PLAIN, BENT], ids=["plain", "lens and DOE"])
 def test_bounds_are_those_of_the_formulas_for_arrays(devices: tuple[Device, Device]) -> None:
     rng = np.random.default_rng(8)
-    poses = look_at((60.0, 0.0, 290.0)), look_at((-40.0, 30.0, 290.0))
+    poses = POSES
     points = np.column_stack([rng.uniform(-80, 80, (COUNT, 2)), rng.uniform(-10, 10, COUNT)])
     normals = rng.normal(size=(COUNT, 3)) * 0.5 + [0, 0, 1]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -342,8 +334,7 @@ def test_one_frame_that_sees_through_an_invented_patch_outweighs_two_that_decode
         if number == 1:
             return coords
         row, column = np.mgrid[: CAMERA.h, : CAMERA.w] + 0.5
-        x, y, z = np.linalg.solve(poses[number][0], [*(RADIUS * towards), 1.0])[:3]
-        u, v = CAMERA.cx - CAMERA.fl_x * x / z, CAMERA.cy + CAMERA.fl_y * y / z
+        u, v = pixels(CAMERA, poses[number][0], RADIUS * towards)
         return np.where((np.hypot(column - u, row - v) < 7)[..., None], np.float32(np.nan), coords)
 
     result = trim_to_observed(bulged, scan_of(truth, poses, tmp_path / "scan", undecoded))
@@ -358,31 +349,36 @@ def cells(number: int, share: float, across: int = 16, size: int = 6) -> np.ndar
     return np.kron(chosen, np.ones((size, size), dtype=bool))
 
 
+FINE = CAMERA.scaled(2.0)
+
+
+@pytest.fixture(scope="module")
+def faces_observed(truth, tmp_path_factory) -> dict[int, int]:
+    """Triangles that stay where one frame and where all of them decode everything."""
+    root = tmp_path_factory.mktemp("fine")
+    scans = {n: scan_of(truth, RING[:n], root / str(n), camera=FINE) for n in (1, len(RING))}
+    return {n: len(trim_to_observed(truth, scan).mesh.faces) for n, scan in scans.items()}
+
+
 @pytest.mark.parametrize("share", [0.15, 0.5])
-def test_undecoded_cells_inside_the_mask_make_no_hole(truth, tmp_path, share):
-    camera = CAMERA.scaled(2.0)
-    whole = trim_to_observed(truth, scan_of(truth, RING, tmp_path / "a", camera=camera)).mesh
+def test_undecoded_cells_inside_the_mask_make_no_hole(truth, faces_observed, tmp_path, share):
     blank = np.float32(np.nan)
     ball_scan = scan_of(
-        truth, RING, tmp_path / "b", lambda i, c: np.where(cells(i, share, 32)[..., None], blank, c), camera
+        truth, RING, tmp_path / "scan", lambda i, c: np.where(cells(i, share, 32)[..., None], blank, c), FINE
     )
     holey = trim_to_observed(truth, ball_scan).mesh
     assert euler(holey) == 1
-    assert len(holey.faces) == pytest.approx(len(whole.faces), rel=0.05)  # cells at the border are no gaps
+    assert len(holey.faces) == pytest.approx(faces_observed[len(RING)], rel=0.05)  # cells at the border are no gaps
 
 
 @pytest.mark.parametrize("frames", [1, 6])
-def test_wrongly_decoded_cells_make_no_hole(truth, tmp_path, frames):
+def test_wrongly_decoded_cells_make_no_hole(truth, faces_observed, tmp_path, frames):
     """3 % wrong cells, off by 60 px; with one frame nothing else confirms the surface there."""
-    camera, poses = CAMERA.scaled(2.0), RING[:frames]
-    wrong = scan_of(
-        truth, poses, tmp_path / "a", lambda i, c: c + np.float32(60) * cells(i, 0.03, 96, 2)[..., None], camera
-    )
+    root, off = tmp_path / "scan", np.float32(60)
+    wrong = scan_of(truth, RING[:frames], root, lambda i, c: c + off * cells(i, 0.03, 96, 2)[..., None], FINE)
     result = trim_to_observed(truth, wrong)
     assert euler(result.mesh) == 1
-    assert len(result.mesh.faces) == pytest.approx(
-        len(trim_to_observed(truth, scan_of(truth, poses, tmp_path / "b", None, camera)).mesh.faces), rel=0.02
-    )
+    assert len(result.mesh.faces) == pytest.approx(faces_observed[frames], rel=0.02)
     assert frames > 1 or result.closed > 0
 
 
@@ -464,8 +460,7 @@ def test_a_floating_piece_that_no_frame_confirms_goes(truth, tmp_path):
 
 def covered_pixels(T_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Pixels within two of a projection of the points."""
-    p = (points - T_camera[:3, 3]) @ T_camera[:3, :3]
-    u, v = 160 * p[:, 0] / -p[:, 2] + 48, -160 * p[:, 1] / -p[:, 2] + 48
+    u, v = pixels(CAMERA, T_camera, points).T
     out = np.zeros((96, 96), dtype=bool)
     for dy in range(-2, 3):
         for dx in range(-2, 3):

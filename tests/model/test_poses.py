@@ -46,14 +46,6 @@ def test_a_rig_moves_as_a_whole_about_the_scene_and_its_projector_relative_to_th
     assert torch.allclose(inverse(camera) @ projector, rho @ inverse(random_poses(0)) @ random_poses(1), atol=1e-13)
 
 
-def test_a_static_projector_stays_while_its_cameras_turn_about_the_scene():
-    poses = make(projector_moves_by="nothing", refine_projector=False)
-    set_steps(poses)
-    camera, projector = poses()
-    assert torch.equal(projector, random_poses(1))
-    assert torch.allclose(camera, exp_se3(poses.camera_step) @ random_poses(0), atol=1e-12)
-
-
 def test_independent_devices_turn_about_themselves():
     poses = make(projector_moves_by="own pose", about_scene=False)
     with torch.no_grad():
@@ -101,16 +93,6 @@ def test_continuing_from_other_poses(kind):
     )
     assert not poses.camera_step.any() and not poses.projector_step.any()
     assert torch.equal(poses.start_camera, random_poses(0)) and torch.equal(poses.start_projector, random_poses(1))
-
-
-def test_a_shared_projector_moves_alike_in_all_frames():
-    poses = make(shared_projector=True)
-    assert poses.projector_step.shape == (1, 6)
-    set_steps(poses)
-    camera, projector = poses()
-    relative = inverse(camera) @ projector
-    moved = relative @ inverse(inverse(random_poses(0)) @ random_poses(1))
-    assert torch.allclose(moved, exp_se3(poses.projector_step).expand(FRAMES, 4, 4), atol=1e-13)
 
 
 @ALL_KINDS

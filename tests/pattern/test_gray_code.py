@@ -37,11 +37,6 @@ def test_the_sequence_encodes_the_cell_of_every_pixel(layout):
     np.testing.assert_allclose(picture, (finest[0] + finest[1]) / 2)
 
 
-def test_full_hd_in_cells_of_two_pixels_is_42_images():
-    layout = GrayCode(1920, 1080, 2)
-    assert (layout.columns, layout.rows, layout.bits, layout.images) == (960, 540, (10, 10), 42)
-
-
 def test_the_description_is_read_back(tmp_path):
     path = tmp_path / "pattern.json"
     path.write_bytes(GrayCode(1280, 720, 4).encode())

@@ -107,13 +107,6 @@ def test_folders_that_hold_no_captures(tmp_path, sequences, files, message):
     assert "remedy:" in str(caught.value)
 
 
-def test_when_nothing_can_be_read_the_first_reason_is_given(tmp_path):
-    for name in ("a.png", "b.png"):
-        (tmp_path / name).write_bytes(np.random.default_rng(0).bytes(100))
-    with pytest.raises(UserError, match=r"a\.png: is not an image that can be read"):
-        find_captures(tmp_path, sequences=False)
-
-
 SIZE = (320, 240)
 
 

@@ -153,15 +153,6 @@ def test_an_image_that_breaks_after_it_was_found_is_a_failure_of_its_frame(copy,
     assert result.stage == "reading" and "1.png: is empty" in result.reason and result.cloud is None
 
 
-def test_decoded_frames_that_were_removed_are_an_error(ramp_scan, tmp_path):
-    worker = FrameWorker(ramp_scan.job(tmp_path / "w"))
-    result = worker(_found(ramp_scan).frames[1])
-    assert worker.load(result).rate == 1
-    shutil.rmtree(tmp_path / "w")
-    with pytest.raises(UserError, match=f"the decoded frame {NAMES[1]} is missing\n.*cause:.*\n.*remedy: start again"):
-        worker.load(result)
-
-
 @pytest.mark.slow
 def test_several_processes_give_the_same_and_one_that_is_killed_is_explained(ramp_scan, tmp_path):
     captures = _found(ramp_scan)

@@ -91,15 +91,6 @@ def test_what_is_no_mask_is_refused_with_cause_and_remedy(tmp_path, image, words
     assert error.value.path == path and error.value.cause and error.value.remedy
 
 
-@pytest.mark.parametrize(("content", "words"), [(b"", "is empty"), (b"no image", "is not an image that can be read")])
-def test_a_broken_file_is_named(tmp_path, content, words):
-    (tmp_path / "m.png").write_bytes(content)
-    with pytest.raises(FileError, match=words):
-        read_mask(tmp_path / "m.png", (W, H))
-    with pytest.raises(FileError, match="is missing"):
-        read_mask(tmp_path / "n.png", (W, H))
-
-
 def test_a_truncated_palette_image_and_a_rotated_one_are_refused(tmp_path):
     whole = _save(tmp_path / "a.png", _palette()).read_bytes()
     (tmp_path / "b.png").write_bytes(whole[: len(whole) - 30])

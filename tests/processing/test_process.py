@@ -11,7 +11,6 @@ import pytest
 
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.lie import fit_similarity
 from sl_nerfstudio.processing import consistency
 from sl_nerfstudio.processing import process as stages
 from sl_nerfstudio.processing.captures import find_captures
@@ -25,6 +24,7 @@ from sl_nerfstudio.registration.result import NoCommonSurface, Registration, Und
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import read_image
 from sl_nerfstudio.storage import NewFolder
+from tests.formulas import pose_errors
 from tests.processing.conftest import SHORT, register_ramps
 from tests.processing.ramp_scan import LAYOUT, NAMES
 
@@ -94,12 +94,8 @@ def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, whole):
     assert (root / "s" / "processing.html").read_text() == "4 of 4"
     assert json.loads((root / "s" / "processing.json").read_text()) == json.loads(json.dumps(result.document()))
     found, true = read_scan(root / "s").poses.T_world_camera, ramp_scan.T_world_camera
-    S = fit_similarity(found[:, :3, 3], true[:, :3, 3])
-    distance = np.linalg.norm(true[:, :3, 3], axis=1).mean()
-    assert np.linalg.norm(S.points(found[:, :3, 3]) - true[:, :3, 3], axis=1).max() < 1e-3 * distance
-    turned = S.poses(found)[:, :3, :3] @ true[:, :3, :3].transpose(0, 2, 1)
-    angles = np.degrees(np.arccos(np.clip((np.trace(turned, axis1=1, axis2=2) - 1) / 2, -1, 1)))
-    assert angles.max() < 0.3
+    _, degrees, off = pose_errors(found, true)
+    assert off.max() < 1e-3 * np.linalg.norm(true[:, :3, 3], axis=1).mean() and degrees.max() < 0.3
 
 
 @pytest.mark.slow
@@ -117,10 +113,8 @@ def test_without_the_adjustment_the_poses_are_those_of_the_registration_and_sigm
     scan, adjusted = read_scan(tmp_path / "s"), read_scan(whole[2] / "s")
     np.testing.assert_allclose(scan.poses.T_world_camera, registered[0].T_world_camera, atol=1e-9)
     np.testing.assert_allclose(scan.poses.baseline, registered[0].baseline, rtol=1e-9)
-    true = ramp_scan.T_world_camera
-    S = fit_similarity(scan.poses.T_world_camera[:, :3, 3], true[:, :3, 3])
-    errors = np.linalg.norm(S.points(scan.poses.T_world_camera[:, :3, 3]) - true[:, :3, 3], axis=1) / S.scale
-    for error, rough, fine in zip(errors, scan.frames, adjusted.frames, strict=True):
+    S, _, off = pose_errors(scan.poses.T_world_camera, ramp_scan.T_world_camera)
+    for error, rough, fine in zip(off / S.scale, scan.frames, adjusted.frames, strict=True):
         assert rough.pose_sigma is not None and fine.pose_sigma is not None
         assert rough.pose_sigma.camera_rotation_deg >= 1.0 > fine.pose_sigma.camera_rotation_deg
         distance = np.linalg.norm(rough.T_world_camera[:3, 3])
@@ -146,9 +140,7 @@ def test_a_frame_that_registration_left_out_is_placed_after_the_adjustment(lose,
     assert [frame.name for frame in read_scan(tmp_path / "s").frames] == list(NAMES)
     assert all(frame.in_scan for frame in result.frames) and result.recapture == ()
     found, true = read_scan(tmp_path / "s").poses.T_world_camera, ramp_scan.T_world_camera
-    S = fit_similarity(found[:, :3, 3], true[:, :3, 3])
-    distance = np.linalg.norm(true[:, :3, 3], axis=1).mean()
-    assert np.linalg.norm(S.points(found[:, :3, 3]) - true[:, :3, 3], axis=1).max() < 2e-3 * distance
+    assert pose_errors(found, true)[2].max() < 2e-3 * np.linalg.norm(true[:, :3, 3], axis=1).mean()
 
 
 def test_fewer_than_two_registered_frames_are_an_error_with_a_report(lose, ramp_scan, tmp_path):

@@ -40,6 +40,7 @@ from sl_nerfstudio.registration.result import (
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind, estimate_relative_pose
 from sl_nerfstudio.review.agreement import SurfaceShares
 from sl_nerfstudio.scan import PickedPixel, Scale
+from tests.formulas import pixels
 from tests.processing.conftest import SHORT
 from tests.processing.ramp_scan import NAMES
 from tests.relative_pose.two_views import view
@@ -130,9 +131,9 @@ def test_placed_points_are_where_both_devices_see_them(config, results, registra
     for k, frame in enumerate(group.frames):
         assert 100 < len(frame.points) <= 2000
         np.testing.assert_array_equal(frame.T_world_camera, poses.adjusted.poses.T_world_camera[k])
-        np.testing.assert_allclose(_seen(frame.camera, frame.T_world_camera, frame.points), frame.uv_camera, atol=0.1)
+        np.testing.assert_allclose(pixels(frame.camera, frame.T_world_camera, frame.points), frame.uv_camera, atol=0.1)
         column, row = np.floor(frame.uv_camera).astype(int).T
-        seen = _seen(frame.projector, frame.T_world_projector, frame.points)
+        seen = pixels(frame.projector, frame.T_world_projector, frame.points)
         off = np.linalg.norm(seen - clouds[k].coords[row, column], axis=1)
         assert np.median(off) < 0.1 and off.max() < 1
 
@@ -154,7 +155,7 @@ def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, 
         np.testing.assert_array_equal(frame.T_world_camera, T[k])
         baseline = np.linalg.norm(frame.T_world_projector[:3, 3] - T[k, :3, 3])
         assert baseline == pytest.approx((0.5, 2.0)[k])
-        np.testing.assert_allclose(_seen(frame.camera, T[k], frame.points), frame.uv_camera, atol=0.1)
+        np.testing.assert_allclose(pixels(frame.camera, T[k], frame.points), frame.uv_camera, atol=0.1)
     alone = summarise(config, "ramps", results, replace(apart, separate=()), poses).placed
     assert [(g.component, len(g.frames)) for g in alone] == [(0, 2), (-1, 1), (-1, 1)]
     assert [g.frames[0].name for g in alone[1:]] == list(NAMES[2:])
@@ -163,12 +164,6 @@ def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, 
     part = np.zeros(clouds_of(results)[0].coords.shape[:2], np.uint8)
     assert not len(scan.only_object({NAMES[0]: part}).frames[0].points)  # nothing of it is the object
     assert scan.only_object({}).frames == scan.frames
-
-
-def _seen(device, T_world_device, p_world):
-    """Pixels of points through a pinhole that looks along -z."""
-    x, y, z = ((p_world - T_world_device[:3, 3]) @ T_world_device[:3, :3]).T
-    return np.stack([device.cx - device.fl_x * x / z, device.cy + device.fl_y * y / z], 1)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.pattern.grid import GridPattern
-from tests.meshing.ray_cast_scan import look_at
+from tests.formulas import look_at, on_ball, pixels, rays
 
 RADIUS = 40.0  # mm, about the origin
 CAMERA = Device(w=160, h=160, fl_x=460.0, fl_y=460.0, cx=80.0, cy=80.0)
@@ -41,20 +41,11 @@ def ball(cells: int = 90) -> Mesh:
 
 def seen_at(x: ndarray, y: ndarray) -> Lit:
     """The nearest point of the ball on the ray of a camera pixel, and where the projector sees it."""
-    d = np.stack([(x - CAMERA.cx) / CAMERA.fl_x, -(y - CAMERA.cy) / CAMERA.fl_y, -np.ones_like(x)], -1)
-    d = d @ T_CAMERA[:3, :3].T
-    d /= np.linalg.norm(d, axis=-1, keepdims=True)
-    o = T_CAMERA[:3, 3]
-    b = d @ o
-    with np.errstate(invalid="ignore"):
-        p = o + (-b - np.sqrt(b**2 - o @ o + RADIUS**2))[..., None] * d
-    q = (p - T_PROJECTOR[:3, 3]) @ T_PROJECTOR[:3, :3]
-    u = PROJECTOR.fl_x * q[..., 0] / -q[..., 2] + PROJECTOR.cx
-    v = -PROJECTOR.fl_y * q[..., 1] / -q[..., 2] + PROJECTOR.cy
-    with np.errstate(invalid="ignore"):
-        lit = ((T_PROJECTOR[:3, 3] - p) * p).sum(-1) > 0
-        lit &= (u >= 0) & (v >= 0) & (u < PROJECTOR.w) & (v < PROJECTOR.h)
-    return Lit(np.where(lit[..., None], np.stack([u, v], -1), np.nan), p)
+    p = on_ball(*rays(CAMERA, T_CAMERA, np.stack([x, y], -1)), RADIUS)
+    uv = pixels(PROJECTOR, T_PROJECTOR, p)
+    lit = ((T_PROJECTOR[:3, 3] - p) * p).sum(-1) > 0  # not where NaN
+    lit &= (uv >= 0).all(-1) & (uv < (PROJECTOR.w, PROJECTOR.h)).all(-1)
+    return Lit(np.where(lit[..., None], uv, np.nan), p)
 
 
 @cache

@@ -8,6 +8,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from tests.formulas import look_at
 
 CAMERA = Device(640, 480, 800.0, 790.0, 322.0, 238.0)
 PROJECTORS = {
@@ -44,15 +45,7 @@ class View:
 
 def pose_of(offset: tuple[float, float, float], target: tuple[float, float, float], roll_deg: float) -> ndarray:
     """Pose in camera axes of a projector at `offset` that looks at `target`."""
-    back = np.subtract(offset, target)
-    back = back / np.linalg.norm(back)
-    right = np.cross([0.0, 1.0, 0.0], back)
-    right = right / np.linalg.norm(right)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([right, np.cross(back, right), back], 1)
-    T[:3, :3] = T[:3, :3] @ Rotation.from_euler("z", roll_deg, degrees=True).as_matrix()
-    T[:3, 3] = offset
-    return T
+    return look_at(offset, target, np.radians(roll_deg), up=(0.0, 1.0, 0.0))
 
 
 def view(

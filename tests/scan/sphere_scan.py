@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter
-from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.errors import Fault
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import Scale, ScanWriter, check_scan
+from tests.formulas import look_at, on_ball, pixels, rays
 
 RADIUS = 40.0
 CAMERA = Device(w=72, h=60, fl_x=150.0, fl_y=152.0, cx=35.0, cy=31.0)
@@ -20,26 +20,15 @@ PROJECTOR = Device(w=128, h=96, fl_x=260.0, fl_y=255.0, cx=66.0, cy=45.0)
 NAMES = ("frame_00000", "frame_00001", "frame_00002", "frame_00003")
 
 
-def look_at(position: ndarray, target: ndarray, roll: float) -> ndarray:
-    """Pose of a device that looks along its -z at `target`, turned by `roll` radian about its axis."""
-    z = (position - target) / np.linalg.norm(position - target)
-    x = np.cross((0.1, 0.2, 1.0), z)
-    x /= np.linalg.norm(x)
-    T = np.eye(4)
-    T[:3, :3] = np.stack([x, np.cross(z, x), z], 1) @ Rotation.from_euler("z", roll).as_matrix()
-    T[:3, 3] = position
-    return T
-
-
 def poses(frames: int = len(NAMES)) -> list[tuple[ndarray, ndarray]]:
     """(T_world_camera, T_world_projector) of frames around the sphere, each with another baseline."""
-    out = []
+    out, up = [], (0.1, 0.2, 1.0)
     for i in range(frames):
         angle = 2 * np.pi * i / max(frames, 3)
         position = 250 * np.array([np.cos(angle), np.sin(angle), 0.5 + 0.1 * i])
-        T_world_camera = look_at(position, np.array([2.0 * i, 0, 0]), 0.2 * i)
+        T_world_camera = look_at(position, (2.0 * i, 0, 0), 0.2 * i, up)
         offset = T_world_camera[:3, :3] @ np.array([60.0 + 5 * i, 20.0 - 10 * i, 4.0])
-        out.append((T_world_camera, look_at(position + offset, np.array([0, 3.0 * i, 0]), 0.2 * i + 0.1)))
+        out.append((T_world_camera, look_at(position + offset, (0, 3.0 * i, 0), 0.2 * i + 0.1, up)))
     return out
 
 
@@ -51,19 +40,9 @@ def pattern_image() -> ndarray:
 
 def correspondences(T_world_camera: ndarray, T_world_projector: ndarray) -> ndarray:
     """Coordinates (h, w, 2) of the sphere by the formulas of the format, float32, NaN off the sphere and in shadow."""
-    x, y = np.meshgrid(np.arange(CAMERA.w) + 0.5, np.arange(CAMERA.h) + 0.5)
-    d = np.stack([(x - CAMERA.cx) / CAMERA.fl_x, -(y - CAMERA.cy) / CAMERA.fl_y, -np.ones_like(x)], -1)
-    d = d / np.linalg.norm(d, axis=-1, keepdims=True) @ T_world_camera[:3, :3].T
-    o = T_world_camera[:3, 3]
-    b, c = d @ o, o @ o - RADIUS**2
-    hit = b * b > c
-    p = o + (-b - np.sqrt(np.where(hit, b * b - c, 0)))[..., None] * d
-    to_projector = T_world_projector[:3, 3] - p
-    lit = hit & ((p * to_projector).sum(-1) > 0)
-    q = -to_projector @ T_world_projector[:3, :3]
-    xp = PROJECTOR.fl_x * q[..., 0] / -q[..., 2] + PROJECTOR.cx
-    yp = -PROJECTOR.fl_y * q[..., 1] / -q[..., 2] + PROJECTOR.cy
-    return np.where(lit[..., None], np.stack([xp, yp], -1), np.nan).astype(np.float32)
+    p = on_ball(*rays(CAMERA, T_world_camera), RADIUS)
+    lit = (p * (T_world_projector[:3, 3] - p)).sum(-1) > 0  # not where NaN
+    return np.where(lit[..., None], pixels(PROJECTOR, T_world_projector, p), np.nan).astype(np.float32)
 
 
 def look_up(pattern: ndarray, coords: ndarray) -> ndarray:

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, look_at, only_fault, poses
+from sphere_scan import CAMERA, NAMES, PROJECTOR, correspondences, edit, only_fault, poses
 
 from sl_nerfstudio.scan import check_scan
 from sl_nerfstudio.scan.check_conventions import apply_interpretation, convention_problems, other_interpretations
 from sl_nerfstudio.scan.check_geometry import Correspondences, fit_geometry, sample_pixels
+from tests.formulas import look_at
 
 pytestmark = pytest.mark.slow
 
@@ -35,7 +36,7 @@ def rigid_rig(count=6):
     out = []
     for index in range(count):
         angle = 2 * np.pi * index / count
-        T = look_at(250 * np.array([np.cos(angle), np.sin(angle), 0.4]), np.zeros(3), 0.3 * index)
+        T = look_at(250 * np.array([np.cos(angle), np.sin(angle), 0.4]), (0, 0, 0), 0.3 * index, (0.1, 0.2, 1.0))
         beside = T.copy()
         beside[:3, 3] += T[:3, :3] @ np.array([30.0, 0, 0])
         out.append((T, beside))

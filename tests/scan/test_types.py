@@ -21,6 +21,7 @@ from sl_nerfstudio.scan import (
     read_scan,
     write_transforms,
 )
+from tests.formulas import on_ball, rays
 
 BAR = ScaleBar((PickedPixel(NAMES[1], (30.25, 20.0)), PickedPixel(NAMES[3], (40.5, 33.5))), 51.5)
 BASELINE = Scale(True, "a ruler", baseline_of=NAMES[2])
@@ -122,13 +123,6 @@ def test_a_number_alone_is_refused_once_frames_were_removed(sphere, number):
     assert f"names frame number {number}" in fault.problem and "removed" in fault.cause
 
 
-def test_an_old_scan_that_lost_the_frame_with_the_known_baseline_says_so(sphere):
-    edit(sphere, with_scale({"known": True, "source": f"baseline of frame 1 ({NAMES[1]})"}))
-    edit(sphere, remove(NAMES[1]))
-    fault = only_fault(sphere)
-    assert (fault.field, fault.problem) == ("scale.baseline_of", f"names frame {NAMES[1]!r}, which is not in the scan")
-
-
 def test_a_sentence_is_not_read_where_data_say_otherwise_or_nothing_is_known(sphere):
     edit(sphere, with_scale({"known": True, "source": "baseline of frame 1", "baseline_of": NAMES[0]}))
     assert read_scan(sphere).scale.baseline_of == NAMES[0]
@@ -193,11 +187,7 @@ def test_a_bar_where_nothing_was_decoded_is_found_by_the_full_check(sphere):
 
 def on_sphere(index, pixel):
     """Where the ray of a pixel meets the sphere, by formula."""
-    T = poses()[index][0]
-    direction = np.array([(pixel[0] - CAMERA.cx) / CAMERA.fl_x, -(pixel[1] - CAMERA.cy) / CAMERA.fl_y, -1.0])
-    d = T[:3, :3] @ (direction / np.linalg.norm(direction))
-    o = T[:3, 3]
-    return o + (-(d @ o) - np.sqrt((d @ o) ** 2 - o @ o + RADIUS**2)) * d
+    return on_ball(*rays(CAMERA, poses()[index][0], np.array(pixel)), RADIUS)
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,9 @@ from sl_nerfstudio.scan.check import check_scan
 from sl_nerfstudio.scan.images import as_grey, read_image
 from sl_nerfstudio.synthesis.appearance import HARD, REALISTIC
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.devices import disturb_image, pixels
+from sl_nerfstudio.synthesis.devices import pixels
 from sl_nerfstudio.synthesis.photograph import Shot, choose_useless, plan_shots, turn_away
-from sl_nerfstudio.synthesis.render import FrameGeometry, render_capture
-from sl_nerfstudio.synthesis.synthesise import Stream, make_setup, synthesise
+from sl_nerfstudio.synthesis.synthesise import make_setup, synthesise
 
 _CONFIG = SynthConfig(frames=8, resolution=90, seed=6, images_only=True, supersampling=1)
 
@@ -128,18 +127,3 @@ def test_a_camera_that_looks_away_does_not_show_the_object():
     assert np.array_equal(turned.T_world_projector, setup.truth.T_world_projector)
     seen = [pixels(setup.devices.camera, T, setup.scene.vertices)[1].any() for T in turned.T_world_camera]
     assert seen == [False] * 29 + [True]
-
-
-def test_plain_captures_are_those_of_the_first_version(tmp_path):
-    """Streams 1 to 5 of the seed, and the same light: nothing else has entered the images."""
-    assert [s.value for s in Stream][:6] == [1, 2, 3, 4, 5, 6]
-    config = SynthConfig(frames=3, resolution=60, seed=9)
-    setup = make_setup(config)
-    assert setup.photography is None and setup.surroundings is None
-    assert np.array_equal(setup.caster.scene.vertices, setup.scene.vertices)
-    at = setup.truth.T_world_camera[1], setup.truth.T_world_projector[1]
-    direct = render_capture(FrameGeometry(setup.caster, setup.devices, *at), setup.pattern, setup.appearance, 2)
-    assert np.array_equal(direct.radiance, setup.render(1, 2).radiance)
-    image = disturb_image(direct.radiance, 1.05, config.sensor_noise, np.random.default_rng([9, 5, 1]))
-    synthesise(replace(config, images_only=True), tmp_path / "captures")
-    assert np.array_equal(read_image(tmp_path / "captures/images/frame_00001.png"), image)

@@ -7,7 +7,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
 from sl_nerfstudio.synthesis.devices import DevicePair
-from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, render_capture, visible_points
+from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, render_capture
 from sl_nerfstudio.synthesis.sdf import Scene
 
 CAMERA = Device(64, 48, 100.0, 100.0, 32.0, 24.0)
@@ -35,46 +35,6 @@ def above(x: float, z: float) -> ndarray:
 
 
 T_CAMERA, T_PROJECTOR = above(0.0, 300.0), above(60.0, 300.0)
-
-
-def test_rays_hit_a_plane_where_they_should_and_miss_beside_it():
-    caster = RayCaster(scene_of(square(50.0, 7.0)))
-    d = np.array([[0.1, 0.05, -1.0], [0.0, 0.0, -1.0], [0.3, 0.0, -1.0], [0.0, 0.0, 1.0]])
-    d /= np.linalg.norm(d, axis=1, keepdims=True)
-    hits = caster.first_hits(np.array([0.0, 0.0, 300.0]), d)
-    expected = np.array([0.0, 0.0, 300.0]) + d[:2] * ((7.0 - 300.0) / d[:2, 2:])
-    np.testing.assert_allclose(hits.p_world[:2], expected, atol=1e-12)
-    assert (hits.face[2:] == -1).all() and np.isnan(hits.p_world[2:]).all()
-
-
-def test_the_nearest_surface_hides_what_is_behind_it():
-    scene = scene_of(square(50.0, 0.0), square(10.0, 40.0))
-    caster = RayCaster(scene)
-    eye = np.array([0.0, 0.0, 300.0])
-    points = np.array([[5.0, 5.0, 0.0], [30.0, 5.0, 0.0]])
-    assert caster.sees(eye, points, np.array([0, 0])).tolist() == [False, True]
-    d = (points - eye) / np.linalg.norm(points - eye, axis=1, keepdims=True)
-    assert caster.first_hits(eye, d).p_world[:, 2] == pytest.approx([40.0, 0.0], abs=1e-9)
-
-
-def test_correspondences_of_a_plane_are_exact_and_end_in_the_shadow():
-    """A small square at 40 mm throws a shadow onto the plane: by similar triangles about the projector."""
-    scene = scene_of(square(80.0, 0.0), square(10.0, 40.0))
-    x, y = np.meshgrid(np.arange(CAMERA.w) + 0.5, np.arange(CAMERA.h) + 0.5)
-    uv = np.stack([x, y], -1).reshape(-1, 2)
-    seen = visible_points(FrameGeometry(RayCaster(scene), DEVICES, T_CAMERA, T_PROJECTOR), uv)
-    p = seen.p_world
-    on_plane = np.isclose(p[:, 2], 0, atol=1e-9)
-    np.testing.assert_allclose(
-        p[on_plane, :2], 3.0 * np.stack([uv[on_plane, 0] - 32, 24 - uv[on_plane, 1]], 1), atol=1e-9
-    )
-    expected = np.stack([100 + (p[:, 0] - 60), 80 - p[:, 1]], 1)[on_plane]  # 300 px of focal length, 300 mm away
-    np.testing.assert_allclose(seen.uv_projector[on_plane], expected, atol=1e-9)
-    stretch = 300 / (300 - 40)
-    shadow = np.abs(p[:, :2] - [60 * (1 - stretch), 0]).max(1) < 10 * stretch
-    inside = (np.abs(seen.uv_projector - [100, 80]) < [100, 80]).all(1)
-    assert seen.hit.sum() > 2000 and shadow[on_plane].sum() > 20
-    assert np.array_equal(seen.lit[on_plane], (inside & ~shadow)[on_plane])
 
 
 def test_light_follows_the_cosine_and_distance_laws():
