@@ -228,7 +228,7 @@ def read_record(path: Path) -> ProcessRecord:
 def _recorded(kind: type[_Record], stated: dict[str, Any]) -> _Record:
     """A record with lists as tuples; what other versions wrote besides does not count."""
     known = {one.name for one in fields(kind)}
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in stated.items() if k in known}
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stated.items() if k in known}
     return kind(**values)
 
 

@@ -287,7 +287,8 @@ def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[Surfac
     quality = report.inputs.quality
     sigma = None if quality is None else quality.sigma
     scan, record = report.inputs.scan, report.inputs.record
-    numbers = {frame.name: k for k, frame in enumerate(scan.frames if record is None else record.frames)}
+    numbers = {frame.name: k for k, frame in enumerate(scan.frames)}
+    numbers |= {} if record is None else {frame.name: k for k, frame in enumerate(record.frames)}
     view = mesh_scene(surface, layers, scan, report.inputs.poses, numbers, sigma, report.inputs.colour)
     errors = None if scale is None else _errors(report, surface, surface.sample(50_000, 0)[0])[0]
     drawn = [data_uri(render(surface, v, colours)) for v in views]
