@@ -180,7 +180,7 @@ def read_inputs(
     truth = read_ground_truth(scan)
     path = poses / TRANSFORMS if poses and poses.is_dir() else poses
     training = None if path is None else path.with_name("training.json")
-    quality, colour, record = read_quality(mesh), read_colour(mesh), data / "processing.json"
+    quality, colour, record = read_quality(mesh), read_colour(mesh), scan.root / "processing.json"
     evaluated = scan.poses if path is None else read_refined_poses(path, scan)
     scan = scan if path is None else read_devices(path, scan)
     return EvaluationInputs(

@@ -195,9 +195,9 @@ def test_two_clicks_state_a_known_length_that_sl_process_understands(name):
     ))  # fmt: skip
     frames = (FrameRecord("a", **GOOD), FrameRecord(name, **GOOD))
     page = render_processing_report(_result(frames, edges=(), placed=(placed,)), [Preview(None, None)] * 2)
-    assert "Click two points" in clicked(page)["said"] and not clicked(page, (0.4, 0.5))["known"]
+    assert "Click two points" in clicked(page)["said"] and not clicked(page, (0.27, 0.5))["known"]
     assert clicked(page, (0.02, 0.5))["said"] == clicked(page)["said"]  # beside the object
-    found = clicked(page, (0.4, 0.5), (0.6, 0.5))
+    found = clicked(page, (0.27, 0.5), (0.73, 0.5))
     assert found["known"] and found["layers"] == ["shaded", "frames"]
     flag, text = shlex.split(found["flag"])
     known = parse_known_length(text)

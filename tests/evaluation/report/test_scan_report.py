@@ -156,7 +156,7 @@ def test_the_object_the_verdict_and_three_figures_come_first_and_what_is_good_is
     text = text_of(full_report)
     assert text.index("coordinates agree to") < text.index("What is not good") < text.index("Every judged figure")
     judged = re.findall(r'<tr class="(\w+)"><th scope="row">([^<]+)</th>', full_report)
-    assert {name for _, name in judged} <= SECTIONS.keys() and {band for band, _ in judged} > {"good"}
+    assert {name for _, name in judged} <= SECTIONS.keys() and "good" in {band for band, _ in judged}
     unfolded = {SECTIONS[name] for band, name in judged if band != "good"} | {"poses"}  # a frame could not be placed
     found = Page(full_report).unfolded
     sections = set(SECTIONS.values()) | {"scan"}
@@ -171,7 +171,7 @@ def test_the_captures_half_says_what_processing_said(full_report: str) -> None:
     for what in ("0: lost <x> left out", "shows nothing cause: dark", "lost <x>: capture it again", "no: decoding",
                  "1.50 px before and 0.40 px after", "half lie within 0.21 px and 95 % within 0.83 px"):  # fmt: skip
         assert what in text, what
-    assert text.count("0.77") == 3 and text.index("0: lost <x>") < text.index("Every judged figure")
+    assert full_report.count('<td class="n">0.77</td>') == 3 and text.index("0: lost <x>") < text.index("Every judged figure")
 
 
 def test_every_judged_figure_has_a_section() -> None:
@@ -207,7 +207,7 @@ def test_pyramids_stand_where_the_devices_do_and_open_towards_what_they_see(full
     views = (true.T_world_camera, CAMERA), (true.T_world_projector, made.projector)
     for (T, device), shown in zip(views, surface["devices"], strict=True):
         drawn = unpacked(shown["lines"], columns=3).reshape(3, 26, 3)
-        np.testing.assert_allclose(drawn[:, 0] + surface["origin"], T[:, :3, 3], rtol=1e-5)
+        np.testing.assert_allclose(drawn[:, 0] + surface["origin"], T[:, :3, 3], atol=1e-4)
         ray = np.array([-device.cx / device.fl_x, device.cy / device.fl_y, -1.0])  # of the upper left corner
         side = drawn[:, 1] - drawn[:, 0]
         expected = np.einsum("nij,j->ni", T[:, :3, :3], ray / np.linalg.norm(ray))
