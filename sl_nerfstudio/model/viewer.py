@@ -213,7 +213,7 @@ def _evenly(decoded: ndarray) -> tuple[ndarray, ndarray]:
 RENDERED, SHADED = "as rendered", "shaded"
 MODES = (RENDERED, SHADED, "normals", "depth", "coordinates", "residual", "sigma", "views")
 RESOLUTION = 192  # cells along the scene's box: seconds
-CLAY = (204, 199, 189)  # colour of the shaded surface
+CLAY = (112, 109, 103)  # dark, because the viewer has strong lights
 UNKNOWN = (110, 110, 110)  # colour where a value does not exist
 
 

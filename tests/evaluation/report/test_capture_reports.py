@@ -182,6 +182,8 @@ def test_discs_lie_in_the_surface_and_face_the_camera_that_saw_them():
         (4 * np.pi / 1600) ** 0.5 < surface.radius < 3 * (4 * np.pi / 1600) ** 0.5
     )  # they cover it, and not much more
     assert set(surface.layers[0].values) == {0.0, 4.0}
+    many = PlacedGroup(0, tuple(_placed(str(k), 0.1 * k, 10_000) for k in range(13)))
+    assert 40_000 < len(placed_surface(many, {str(k): k for k in range(13)}).points) <= 60_000  # a page stays small
 
 
 @pytest.mark.parametrize("name", ["b", "it's $5 (new)"])

@@ -171,7 +171,9 @@ def test_the_captures_half_says_what_processing_said(full_report: str) -> None:
     for what in ("0: lost <x> left out", "shows nothing cause: dark", "lost <x>: capture it again", "no: decoding",
                  "1.50 px before and 0.40 px after", "half lie within 0.21 px and 95 % within 0.83 px"):  # fmt: skip
         assert what in text, what
-    assert full_report.count('<td class="n">0.77</td>') == 3 and text.index("0: lost <x>") < text.index("Every judged figure")
+    assert full_report.count('<td class="n">0.77</td>') == 3 and text.index("0: lost <x>") < text.index(
+        "Every judged figure"
+    )
 
 
 def test_every_judged_figure_has_a_section() -> None:
