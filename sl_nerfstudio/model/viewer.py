@@ -246,7 +246,8 @@ class ViewerSurface:
         """The colours of one of `MODES`; `frame` is the one whose devices depth and coordinates are of."""
         units = self._model.scan.units
         if mode == SHADED:
-            return Coloured(np.tile(np.uint8(CLAY), (len(self.mesh.vertices), 1)), f"The surface at step {self.step}.")
+            rgb = np.tile(np.array(CLAY, np.uint8), (len(self.mesh.vertices), 1))
+            return Coloured(rgb, f"The surface at step {self.step}.")
         if mode == "normals":
             rgb = 0.5 * self.mesh.vertex_normals() + 0.5
             return Coloured(_bytes(rgb), "Direction of the surface: red is x, green y, blue z.")

@@ -157,10 +157,10 @@ def render_discs(
     height: int,
     width: int,
 ) -> Float[ndarray, "h w 3"]:
-    """A shaded orthographic picture on white of points, as discs; framed on all but the outermost 1 % on each side."""
+    """A shaded orthographic picture on white of points, as discs; framed on all but the outermost 0.2 %."""
     right, up, back = _view_axes(view)
     x, y = points @ right, points @ up
-    (left, bottom), (far_right, top) = ([np.percentile(v, q) for v in (x, y)] for q in (1, 99))
+    (left, bottom), (far_right, top) = ([np.percentile(v, q) for v in (x, y)] for q in (0.2, 99.8))
     pixel = max((far_right - left) / (width * 0.9), (top - bottom) / (height * 0.9), 1e-12)
     k = max(1, min(math.ceil(radius / pixel), height // 20))
     square = np.mgrid[-k : k + 1, -k : k + 1].reshape(2, -1)
