@@ -1,7 +1,6 @@
 """sl-eval: compare a mesh and its poses with a scan, and with the truth if it is known."""
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ import tyro
 
 from sl_nerfstudio.cli.arguments import SCAN, parse
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import figure, paragraph, phase, unit_word
+from sl_nerfstudio.console import paragraph, phase
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -32,17 +31,14 @@ def summary(
 
     `report` is the file with everything else, if one was asked for.
     """
-    fit, rest = evaluation.agreement, "in the report: --report FILE.html" if report is None else f"in {report}"
-    figures = [
-        ("surface", _surface(evaluation, sigma)),
-        ("captures", f"coordinates agree to {fit.coordinate_px_median:.2g} px (median), 95 % to "
-         f"{fit.coordinate_px_p95:.2g} px; worst frame: {_worst_frame(evaluation)}"),
-        ("coverage", _coverage(evaluation)),
-    ]  # fmt: skip
+    from sl_nerfstudio.evaluation.judgement import MAIN_FIGURES, main_figures
+
+    rest = "in the report: --report FILE.html" if report is None else f"in {report}"
+    said = (" ".join(filter(None, parts)) for parts in main_figures(evaluation, sigma))
     return "\n".join(
         [
             f"verdict: {judgement.verdict.band}",
-            *(paragraph(name, text) for name, text in figures),
+            *(paragraph(*both) for both in zip(MAIN_FIGURES, said, strict=True)),
             *_listed("reasons", judgement.verdict.reasons, rest),
             *_listed("next", judgement.next_steps, rest),
         ]
@@ -54,49 +50,6 @@ def _listed(name: str, lines: Sequence[str], rest: str) -> list[str]:
     shown = [paragraph(name if k == 0 else "", line) for k, line in enumerate(lines[:_MOST])]
     more = len(lines) - len(shown)
     return shown + ([paragraph("", f"({more} more {rest})")] if more else [])
-
-
-def _surface(evaluation: "Evaluation", sigma: "Sequence[PoseSigma | None]") -> str:
-    """Say how far it is from the truth, or else how well the poses are known."""
-    from sl_nerfstudio.evaluation.judgement import ALIGNED
-
-    if evaluation.alignment in evaluation.surface:
-        score, unit = evaluation.surface[evaluation.alignment], evaluation.truth_units
-        return (
-            f"{score.accuracy.rmse:.3g} {unit} from the truth (RMS, {ALIGNED[evaluation.alignment]}); the truth is "
-            f"{score.completeness.mean:.3g} {unit} from it (mean)"
-        )
-    known = [s for s in sigma if s is not None]
-    if not known:
-        return "no truth is known, and the poses do not state their uncertainty"
-    lengths, turns = [s.camera_translation for s in known], [s.camera_rotation_deg for s in known]
-    return (
-        f"no truth is known; cameras to {_rms(lengths):.2g} {unit_word(evaluation.units)}, {_rms(turns):.2g}° (1 sigma)"
-    )
-
-
-def _worst_frame(evaluation: "Evaluation") -> str:
-    frames = [f for f in evaluation.agreement.frames if math.isfinite(f.coordinate_px_p95)]
-    if not frames:
-        return "none"
-    worst = max(frames, key=lambda f: f.coordinate_px_p95)
-    return f"{worst.name}, {worst.coordinate_px_p95:.2g} px, {worst.covered_share:.0%} covered"
-
-
-def _coverage(evaluation: "Evaluation") -> str:
-    found = evaluation.completeness
-    if found is None:
-        return f"{evaluation.agreement.hit_share:.1%} of the pixels with pattern"
-    o, unit = found.openings, unit_word(evaluation.units)
-    text = f"{found.observed:.1%} of what the frames decoded"
-    if not len(o):
-        return f"{text}; closed all around"
-    inner = f"{len(o) - 1} holes beside it ({figure(o.area[1:].sum())} {unit}²)" if len(o) > 1 else "no holes beside it"
-    return f"{text}; rim of the scan {figure(found.rim_area)} {unit}², {figure(o.length[0])} {unit} long; {inner}"
-
-
-def _rms(values: Sequence[float]) -> float:
-    return math.sqrt(sum(v * v for v in values) / len(values))
 
 
 def print_tables(evaluation: "Evaluation") -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, UInt8
 from numpy import ndarray
 from scipy.spatial import KDTree
 
@@ -31,10 +31,11 @@ from sl_nerfstudio.evaluation.reference import (
     mesh_reference,
 )
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
-from sl_nerfstudio.meshing.files import read_mesh, read_quality
+from sl_nerfstudio.meshing.files import read_colour, read_mesh, read_quality
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 from sl_nerfstudio.meshing.uncertainty import length_sigma
 from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.processing.result import ProcessRecord, read_record
 from sl_nerfstudio.review.agreement import CrossFrameAgreement, compare_scan_frames
 from sl_nerfstudio.review.verdict import DepartedFrame, departed_frames
 from sl_nerfstudio.runs.export import read_covariance
@@ -150,6 +151,8 @@ class EvaluationInputs:
     quality: VertexQuality | None = None  # of the mesh's vertices, if its file says
     joint: JointCovariance | None = None  # of the evaluated poses, if it is known
     true_units: str | None = None  # of the truth that is compared with, where its files say
+    colour: UInt8[ndarray, "v 3"] | None = None  # sRGB, of the mesh's vertices, if its file has them
+    record: ProcessRecord | None = None  # of the captures, if sl-process made the scan
 
     @property
     def stated_sigma(self) -> list[PoseSigma | None]:
@@ -177,7 +180,7 @@ def read_inputs(
     truth = read_ground_truth(scan)
     path = poses / TRANSFORMS if poses and poses.is_dir() else poses
     training = None if path is None else path.with_name("training.json")
-    quality = read_quality(mesh)
+    quality, colour, record = read_quality(mesh), read_colour(mesh), scan.root / "processing.json"
     evaluated = scan.poses if path is None else read_refined_poses(path, scan)
     scan = scan if path is None else read_devices(path, scan)
     return EvaluationInputs(
@@ -193,6 +196,8 @@ def read_inputs(
         training=read_document(training) if training is not None and training.exists() else None,
         quality=quality if quality is not None and len(quality.sigma) == len(result.vertices) else None,
         joint=None if path is None else read_covariance(path.parent, scan),
+        colour=colour if colour is not None and len(colour) == len(result.vertices) else None,
+        record=read_record(record) if record.exists() else None,
     )
 
 

@@ -23,6 +23,7 @@ from sl_nerfstudio.review.verdict import (
     listed,
     worst,
 )
+from sl_nerfstudio.scan import PoseSigma
 
 # A figure with its judgement by two limits.
 
@@ -56,6 +57,69 @@ def judged(
     text = form.format(value) if math.isfinite(value) else "none"
     worst = limit.format(f"{acceptable:g}") if math.isfinite(acceptable) else "any"
     return JudgedFigure(name, value, text, band, limit.format(f"{good:g}"), worst, meaning, advice)
+
+
+# The three figures that matter, without a judgement: for the console, and for the top of the report.
+
+MAIN_FIGURES = ("surface", "captures", "coverage")
+MainFigure = tuple[str, str, str]
+"""What is said before a value, the value with its unit, and what is said after it."""
+
+
+def main_figures(evaluation: Evaluation, sigma: Sequence[PoseSigma | None]) -> tuple[MainFigure, ...]:
+    """Tell how true the surface is, how well it agrees with the captures, and how much of them it covers.
+
+    `sigma` is what the evaluated poses state.
+    """
+    fit = evaluation.agreement
+    captures = (
+        "coordinates agree to",
+        f"{fit.coordinate_px_median:.2g} px",
+        f"(median), 95 % to {fit.coordinate_px_p95:.2g} px; worst frame: {_worst_frame(evaluation)}",
+    )
+    return _how_true(evaluation, sigma), captures, _how_complete(evaluation)
+
+
+def _how_true(evaluation: Evaluation, sigma: Sequence[PoseSigma | None]) -> MainFigure:
+    """Say how far it is from the truth, or else how well the poses are known."""
+    if evaluation.alignment in evaluation.surface:
+        score, unit = evaluation.surface[evaluation.alignment], evaluation.truth_units
+        return (
+            "",
+            f"{score.accuracy.rmse:.3g} {unit}",
+            f"from the truth (RMS, {ALIGNED[evaluation.alignment]}); the truth is {score.completeness.mean:.3g} {unit} "
+            "from it (mean)",
+        )
+    known = [s for s in sigma if s is not None]
+    if not known:
+        return "no truth is known, and the poses do not state their uncertainty", "", ""
+    length, turn = (
+        math.sqrt(sum(v * v for v in values) / len(known))
+        for values in ([s.camera_translation for s in known], [s.camera_rotation_deg for s in known])
+    )
+    value = f"{length:.2g} {unit_word(evaluation.units)}, {turn:.2g}°"
+    return "no truth is known; cameras to", value, "(1 sigma)"
+
+
+def _worst_frame(evaluation: Evaluation) -> str:
+    frames = [f for f in evaluation.agreement.frames if math.isfinite(f.coordinate_px_p95)]
+    if not frames:
+        return "none"
+    worst = max(frames, key=lambda f: f.coordinate_px_p95)
+    return f"{worst.name}, {worst.coordinate_px_p95:.2g} px, {worst.covered_share:.0%} covered"
+
+
+def _how_complete(evaluation: Evaluation) -> MainFigure:
+    found = evaluation.completeness
+    if found is None:
+        return "", f"{evaluation.agreement.hit_share:.1%}", "of the pixels with pattern"
+    o, unit = found.openings, unit_word(evaluation.units)
+    text = "of what the frames decoded"
+    if not len(o):
+        return "", f"{found.observed:.1%}", f"{text}; closed all around"
+    inner = f"{len(o) - 1} holes beside it ({figure(o.area[1:].sum())} {unit}²)" if len(o) > 1 else "no holes beside it"
+    rim = f"rim of the scan {figure(found.rim_area)} {unit}², {figure(o.length[0])} {unit} long"
+    return "", f"{found.observed:.1%}", f"{text}; {rim}; {inner}"
 
 
 # How completeness is judged: by shares of what was observed, and of the surface.

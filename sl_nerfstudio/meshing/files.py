@@ -104,6 +104,32 @@ def _encode(columns: dict[str, tuple[str, ndarray]], unit: str, element: list[st
 
 def read_quality(path: Path) -> VertexQuality | None:
     """Read what `encode_ply` wrote with a mesh; None for any other file."""
+    rows = _read_rows(path)
+    if rows is None or not {"sigma", "views"} <= set(rows.dtype.names or ()):
+        return None
+
+    def column(name: str) -> Float64[ndarray, "v"]:
+        return rows[name].astype(np.float64) if name in rows.dtype.names else np.full(len(rows), np.nan)
+
+    return VertexQuality(
+        column("sigma"),
+        column("sigma_independent"),
+        rows["views"].astype(np.int64),
+        column("residual"),
+        column("ray_angle"),
+    )
+
+
+def read_colour(path: Path) -> UInt8[ndarray, "v 3"] | None:
+    """The colours of the vertices of a PLY file, as `encode_ply` writes them; None for any other file."""
+    rows, names = _read_rows(path), ("red", "green", "blue")
+    if rows is None or any(rows.dtype.fields.get(name, (None,))[0] != np.uint8 for name in names):
+        return None
+    return np.stack([rows[name] for name in names], 1)
+
+
+def _read_rows(path: Path) -> ndarray | None:
+    """The vertices of a binary PLY file, one row each; None for any other file."""
     with path.open("rb") as stream:
         if stream.read(3) != b"ply":
             return None
@@ -115,26 +141,12 @@ def read_quality(path: Path) -> VertexQuality | None:
         if count is None:
             return None
         fields = re.findall(r"property (\w+) (\w+)\n", count[2])
-        if any(kind not in _TYPES for kind, _ in fields) or not {"sigma", "views"} <= {name for _, name in fields}:
+        if any(kind not in _TYPES for kind, _ in fields) or len({name for _, name in fields}) < len(fields):
             return None
         stream.seek(len(head) + len(mark))
-        known = {name for _, name in fields}
         row = np.dtype([(name, _TYPES[kind]) for kind, name in fields])
         content = stream.read(int(count[1]) * row.itemsize)
-    if len(content) < int(count[1]) * row.itemsize:
-        return None
-    rows = np.frombuffer(content, row)
-
-    def column(name: str) -> Float64[ndarray, "v"]:
-        return rows[name].astype(np.float64) if name in known else np.full(len(rows), np.nan)
-
-    return VertexQuality(
-        column("sigma"),
-        column("sigma_independent"),
-        rows["views"].astype(np.int64),
-        column("residual"),
-        column("ray_angle"),
-    )
+    return np.frombuffer(content, row) if len(content) == int(count[1]) * row.itemsize else None
 
 
 # Meshes as bytes of OBJ and STL files.

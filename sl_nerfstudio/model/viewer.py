@@ -210,9 +210,10 @@ def _evenly(decoded: ndarray) -> tuple[ndarray, ndarray]:
 
 # The surface of the field as a mesh for the viewer, and what it can be coloured by.
 
-RENDERED = "as rendered"
-MODES = (RENDERED, "normals", "depth", "coordinates", "residual", "sigma", "views")
-RESOLUTION = 128  # cells along the scene's box: about a second
+RENDERED, SHADED = "as rendered", "shaded"
+MODES = (RENDERED, SHADED, "normals", "depth", "coordinates", "residual", "sigma", "views")
+RESOLUTION = 192  # cells along the scene's box: seconds
+CLAY = (112, 109, 103)  # dark, because the viewer has strong lights
 UNKNOWN = (110, 110, 110)  # colour where a value does not exist
 
 
@@ -244,6 +245,9 @@ class ViewerSurface:
     def coloured(self, mode: str, frame: int) -> Coloured:
         """The colours of one of `MODES`; `frame` is the one whose devices depth and coordinates are of."""
         units = self._model.scan.units
+        if mode == SHADED:
+            rgb = np.tile(np.array(CLAY, np.uint8), (len(self.mesh.vertices), 1))
+            return Coloured(rgb, f"The surface at step {self.step}.")
         if mode == "normals":
             rgb = 0.5 * self.mesh.vertex_normals() + 0.5
             return Coloured(_bytes(rgb), "Direction of the surface: red is x, green y, blue z.")
@@ -315,7 +319,8 @@ class Panel:
     ) -> None:
         gui = server.gui
         with gui.add_folder("Scan", order=-1.0):
-            self.surface = gui.add_dropdown("Surface", MODES, RENDERED, hint="The surface as a mesh, in these colours")
+            mode = RENDERED if training else SHADED
+            self.surface = gui.add_dropdown("Surface", MODES, mode, hint="The surface as a mesh, in these colours")
             self._legend = gui.add_markdown("", visible=False)
             self.update = gui.add_button("Update surface", visible=False, hint="Make the mesh of the current step")
             last = max(len(names) - 1, 1)
@@ -384,7 +389,7 @@ _FRUSTUM_SIZE = 0.4  # of the devices' distance from the object, times nerfstudi
 _RAY = 0.012  # radius of a ray, as a share of a pyramid's size
 _OBJECT_RADIUS = 0.8  # scene units
 _USUAL_FOV, _USUAL_ASPECT = math.radians(75), 1.5  # of a client that has not said its own
-_MARGIN = 1.1  # pyramids reach a little beyond their centres, and names beyond them
+_MARGIN = 1.1
 
 ScenePoses = tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "n 4 4"]]
 
@@ -425,6 +430,8 @@ class SceneView(ViewerControl):
         self._mark_unplaced()
         self.panel = Panel(self.viser_server, names, viewer.trainer is not None, self._changed)
         self.show_devices()
+        if viewer.trainer is None:
+            self.show_surface()  # at once: what was trained is there
         self.viser_server.on_client_connect(self._look_at_object)
 
     # ---- the user's choices
@@ -551,19 +558,25 @@ class SceneView(ViewerControl):
 
     def _look_at_object(self, client: viser.ClientHandle) -> None:
         fov, aspect = client.camera.fov or _USUAL_FOV, client.camera.aspect or _USUAL_ASPECT
-        view = first_view(np.concatenate(self._numpy_poses()), fov, aspect)
+        points = None if self._surface is None else self._surface.mesh.vertices
+        view = first_view(np.concatenate(self._numpy_poses()), points, fov, aspect)
         client.camera.up_direction = view.up
         client.camera.position = view.eye * VISER_NERFSTUDIO_SCALE_RATIO
         client.camera.look_at = view.centre * VISER_NERFSTUDIO_SCALE_RATIO
 
 
-def first_view(T_scene_device: Float64[ndarray, "n 4 4"], vertical_fov: float, aspect: float) -> Viewpoint:
-    """Framed on the object, beside the first device, and so far away that all devices are in the picture."""
-    corners = _OBJECT_RADIUS * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+def first_view(
+    T_scene_device: Float64[ndarray, "n 4 4"],
+    surface: Float64[ndarray, "v 3"] | None,
+    vertical_fov: float,
+    aspect: float,
+) -> Viewpoint:
+    """Framed on the surface, or on where it will be, beside the first device."""
+    if surface is None:
+        surface = _OBJECT_RADIUS * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
     up, position = np.array([0.0, 0.0, 1.0]), T_scene_device[0, :3, 3]
     direction = beside(position if np.linalg.norm(position) > 0 else T_scene_device[0, :3, 2], up)
-    points = np.concatenate([T_scene_device[:, :3, 3], corners])
-    return far_enough(points, np.zeros(3), direction, up, vertical_fov, aspect, _MARGIN)
+    return far_enough(surface, (surface.min(0) + surface.max(0)) / 2, direction, up, vertical_fov, aspect, _MARGIN)
 
 
 def _thumbnail(pattern: Float[ndarray, "h w"]) -> UInt8[ndarray, "h2 w2 3"]:

@@ -2,9 +2,10 @@
 
 import importlib.metadata
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import pairwise
-from typing import Any
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -46,6 +47,7 @@ from sl_nerfstudio.review.verdict import (
     listed,
     other_places,
 )
+from sl_nerfstudio.scan.document import FileError, read_document
 
 # Sentences for what relative pose estimation and registration found out about frames.
 
@@ -147,6 +149,8 @@ def contradiction(found: SelfCalibration | None, cameras: Sequence[Device], proj
 
 # The records.
 
+_Record = TypeVar("_Record", "FrameRecord", "EdgeRecord")
+
 
 @dataclass(frozen=True)
 class FrameRecord(FrameFacts):
@@ -179,11 +183,10 @@ class EdgeRecord:
     undecided: bool
 
 
-@dataclass(frozen=True)
-class ProcessResult:
-    """Everything the report shows."""
+@dataclass(frozen=True, kw_only=True)
+class ProcessRecord:
+    """What processing.json says of the captures."""
 
-    config: ProcessConfig
     decoder: str
     units: str
     scale_source: str  # "": not known
@@ -195,16 +198,61 @@ class ProcessResult:
     cross_px: tuple[float, float] | None  # the same over all points that two frames saw: median, 95 %
     verdict: Verdict
     versions: dict[str, str]
-    projector: FoundProjector | None = None  # None: the projector is the stated one
-    contradiction: str = ""  # which intrinsics the captures contradict; it is among the remarks, too
-    object_only: ObjectOnly | None = None  # None: surroundings were not looked for
-    captured: CaptureNotes | None = None  # on the captures
-    placed: tuple[PlacedGroup, ...] = field(default=(), compare=False)  # for the 3D view of the report
 
     @property
     def registered(self) -> int:
         """Number of frames in the scan."""
         return sum(frame.in_scan for frame in self.frames)
+
+
+def read_record(path: Path) -> ProcessRecord:
+    """Read a processing.json. Raises FileError if it is none."""
+    document = read_document(path)
+    try:
+        return ProcessRecord(
+            decoder=document["decoder"],
+            units=document["units"],
+            scale_source=document["scale"] or "",
+            frames=tuple(_recorded(FrameRecord, frame) for frame in document["frames"]),
+            edges=tuple(_recorded(EdgeRecord, edge) for edge in document["overlaps"]),
+            remarks=tuple(document["remarks"]),
+            recapture=tuple(document["recapture"]),
+            joint_px=_pair(document["joint_adjustment_px"]),
+            cross_px=_pair(document["cross_frame_px"]),
+            verdict=Verdict(document["verdict"], tuple(document["reasons"])),
+            versions=document["versions"],
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise FileError(
+            path, f"is not what sl-process writes ({error})", "it was edited, or is of another version",
+            "run the same sl-process again, which takes seconds, or remove this file",
+        ) from error  # fmt: skip
+
+
+def _recorded(kind: type[_Record], stated: dict[str, Any]) -> _Record:
+    """A record with lists as tuples; what other versions wrote besides does not count."""
+    known = {one.name for one in fields(kind)}
+    values: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in stated.items() if k in known}
+    return kind(**values)
+
+
+def _pair(values: list[float] | None) -> tuple[float, float] | None:
+    if values is None:
+        return None
+    first, second = map(float, values)
+    return first, second
+
+
+@dataclass(frozen=True, kw_only=True)
+class ProcessResult(ProcessRecord):
+    """Everything the report shows."""
+
+    config: ProcessConfig
+    projector: FoundProjector | None = None  # None: the projector is the stated one
+    contradiction: str = ""  # which intrinsics the captures contradict; it is among the remarks, too
+    object_only: ObjectOnly | None = None  # None: surroundings were not looked for
+    captured: CaptureNotes | None = None  # on the captures
+    placed: tuple[PlacedGroup, ...] = field(default=(), compare=False)  # for the 3D view of the report
 
     def document(self) -> dict[str, Any]:
         """Return the content of processing.json."""

@@ -73,8 +73,8 @@ def stated_scale(known: KnownLength) -> Scale:
 
 # Where the frames are and what they see, for the 3D view of the report.
 
-MOST_POINTS = 40_000  # of all frames together: half a megabyte in the page
-_MOST_OF_A_FRAME = 2000
+MOST_POINTS = 250_000  # of all frames together
+_MOST_OF_A_FRAME = 10_000
 
 
 @dataclass(frozen=True)

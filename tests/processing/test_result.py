@@ -129,7 +129,7 @@ def test_placed_points_are_where_both_devices_see_them(config, results, registra
     assert group.component == 0 and [frame.name for frame in group.frames] == list(NAMES)
     clouds = clouds_of(results)
     for k, frame in enumerate(group.frames):
-        assert 100 < len(frame.points) <= 2000
+        assert 100 < len(frame.points) <= 10_000
         np.testing.assert_array_equal(frame.T_world_camera, poses.adjusted.poses.T_world_camera[k])
         np.testing.assert_allclose(pixels(frame.camera, frame.T_world_camera, frame.points), frame.uv_camera, atol=0.1)
         column, row = np.floor(frame.uv_camera).astype(int).T

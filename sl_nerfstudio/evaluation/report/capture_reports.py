@@ -1,9 +1,11 @@
 """The reports of `sl-process` and `sl-calibrate`: what happened to every capture, as HTML that needs no network."""
 
+import html
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -19,11 +21,17 @@ from sl_nerfstudio.calibration.board_adjustment import Corners
 from sl_nerfstudio.calibration.board_captures import BoardCaptures, BoardPicture
 from sl_nerfstudio.evaluation.report import charts
 from sl_nerfstudio.evaluation.report.charts import data_uri, draw_overlaps, page
-from sl_nerfstudio.evaluation.report.view3d import compressed_script, placed_figure
+from sl_nerfstudio.evaluation.report.view3d import placed_scene
 from sl_nerfstudio.geometry.devices import PARAMETERS, Device
 from sl_nerfstudio.processing.object_only import FrameShares, Preview, object_sentences
 from sl_nerfstudio.processing.projector import describe
-from sl_nerfstudio.processing.result import FrameRecord, ProcessResult, first_line, unconnected_neighbours
+from sl_nerfstudio.processing.result import (
+    FrameRecord,
+    ProcessRecord,
+    ProcessResult,
+    first_line,
+    unconnected_neighbours,
+)
 from sl_nerfstudio.review.verdict import DEVICES, Verdict, shortcomings
 
 # The report of `sl-calibrate`: what was found in every photograph, and how far the result can be trusted.
@@ -153,14 +161,18 @@ def _drawn(w: int, h: int, draw: Callable[[Axes], None], margin: float) -> Float
     return np.asarray(canvas.buffer_rgba(), np.float64)[..., :3] / 255
 
 
+# The captures half of a report: of `sl-process` itself, and of a scan that it made.
+
 _TEMPLATE = "processing.html.j2"
 _WITHOUT_EFFECT = ("output", "work", "jobs")  # flags on which no result depends
+_EMBEDDED = re.compile(r'<img loading="lazy" src="(data:image/webp;base64,[\w+/=]+)" alt="([^"]*)"')
 
 
 @dataclass(frozen=True)
 class FrameRow:
-    """A frame with its pictures."""
+    """A capture with its pictures."""
 
+    number: int
     record: FrameRecord
     image: str  # data addresses; "" where there is no picture
     coords: str
@@ -168,37 +180,87 @@ class FrameRow:
     shares: FrameShares | None  # of what was left out
 
 
+@dataclass(frozen=True)
+class Captures:
+    """What a report shows of the captures: those that need a look on top, all others folded."""
+
+    record: ProcessRecord
+    bad: list[FrameRow]
+    good: list[FrameRow]
+    charts: list[tuple[str, str]]  # caption and drawing
+    overlaps: str
+
+    @staticmethod
+    def of(record: ProcessRecord, rows: Sequence[FrameRow]) -> "Captures":
+        """Left out, undecided, or to be captured again is what needs a look."""
+        again = {name for line in record.recapture for name in line.partition(": ")[0].split(", ")}
+        bad = [r for r in rows if not r.record.in_scan or r.record.undecided or r.record.name in again]
+        overlaps = draw_overlaps(record.frames, record.edges) if record.edges else ""
+        return Captures(record, bad, [r for r in rows if r not in bad], _charts(record.frames), overlaps)
+
+    @property
+    def shown(self) -> set[int]:
+        """Numbers of the captures of which the page has pictures."""
+        return {row.number for row in (*self.bad, *self.good)}
+
+
+def captures_of(record: ProcessRecord, report: Path) -> Captures:
+    """The captures half for another report; pictures are taken from the `report` of `sl-process`, if it is there.
+
+    Captures that are in the scan are shown by that other report itself.
+    """
+    text = report.read_text(encoding="utf-8") if report.is_file() else ""
+    pictures = {html.unescape(what): address for address, what in _EMBEDDED.findall(text)}
+    rows = [
+        FrameRow(k, f, pictures.get(f"Capture {f.name}", ""), pictures.get(f"Coordinates of {f.name}", ""), "", None)
+        for k, f in enumerate(record.frames)
+    ]
+    found = Captures.of(record, rows)
+    return replace(found, good=[])
+
+
 def render_processing_report(result: ProcessResult, previews: Sequence[Preview]) -> str:
     """The page as text."""
     found = result.object_only
     shares = {} if found is None else {share.name: share for share in found.frames}
     rows = []
-    for record, preview in zip(result.frames, previews, strict=True):
+    for k, (record, preview) in enumerate(zip(result.frames, previews, strict=True)):
         shown = (preview.image, preview.coords, preview.left_out)
         image, coords, left_out = ("" if p is None else data_uri(p) for p in shown)
-        rows.append(FrameRow(record, image, coords, left_out, shares.get(record.name)))
+        rows.append(FrameRow(k, record, image, coords, left_out, shares.get(record.name)))
     # The flags on which the scan depends; with others, and at another time, the report is the same byte for byte.
     flags = {key: value for key, value in vars(result.config).items() if key not in _WITHOUT_EFFECT}
-    figure = ""
+    view = None
     if result.placed:
         undecided = [f.name for f in result.frames if f.undecided]
         missing = [] if result.config.unordered else unconnected_neighbours(result.frames, result.edges)
-        figure = placed_figure(result.placed, undecided, missing, {f.name: k for k, f in enumerate(result.frames)})
+        numbers = {f.name: k for k, f in enumerate(result.frames)}
+        view = placed_scene(result.placed, result.units, undecided, missing, numbers)
     values = {
-        "result": result,
-        "rows": rows,
-        "verdict": result.verdict,
+        "captures": Captures.of(result, rows),
         "sentence": _sentence(result),
+        "figures": _figures(result),
         "projector": "" if result.projector is None else describe(result.projector),
         "object_only": () if found is None else object_sentences(found),
-        "charts": _charts(result),
-        "overlaps": draw_overlaps(result.frames, result.edges) if result.edges else "",
         "settings": sorted((key, str(value)) for key, value in flags.items() if value is not None),
-        "figure": figure,
-        "groups": [len(group.frames) for group in result.placed],
-        "plotly": compressed_script() if result.placed else "",
+        "shown": view,
+        "groups": len(result.placed),
     }
     return page(_TEMPLATE, values, first_line=first_line, linked=_linker([f.name for f in result.frames]))
+
+
+def _figures(result: ProcessResult) -> list[tuple[str, str, str]]:
+    """Beside the verdict: what comes before a value, the value, and what comes after it."""
+    rates = [f.decode_rate for f in result.frames if f.decode_rate is not None]
+    lost = len(result.frames) - result.registered
+    share = f"{result.registered} of {len(result.frames)}"
+    figures = [("captures in the scan", share, f"{lost} left out" if lost else "")]
+    if result.cross_px is not None:
+        median, most = result.cross_px
+        figures.append(("frames agree to", f"{median:.2f} px", f"(median; 95 % of the coordinates to {most:.2f} px)"))
+    if rates:
+        figures.append(("of the pattern was decoded", f"{100 * float(np.median(rates)):.0f} %", "(median frame)"))
+    return figures
 
 
 def _linker(names: Sequence[str]) -> Callable[[str], Markup]:
@@ -230,9 +292,8 @@ def _sentence(result: ProcessResult) -> str:
     return f"{begin}{left_out}; {length}."
 
 
-def _charts(result: ProcessResult) -> list[tuple[str, str]]:
+def _charts(frames: Sequence[FrameRecord]) -> list[tuple[str, str]]:
     """Caption and drawing of every chart over the frames."""
-    frames = result.frames
 
     def values(key: str, factor: float = 1.0) -> list[float]:
         return [math.nan if getattr(f, key) is None else factor * getattr(f, key) for f in frames]

@@ -15,10 +15,11 @@ from sl_nerfstudio.calibration.stated import describe_change
 from sl_nerfstudio.console import unit_word
 from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement, FramePixels, frame_pixels
 from sl_nerfstudio.evaluation.evaluate import Evaluation, EvaluationInputs, Length
-from sl_nerfstudio.evaluation.judgement import Judgement
+from sl_nerfstudio.evaluation.judgement import MAIN_FIGURES, Judgement, main_figures
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import MeshReference, PoseErrors, compare_poses
 from sl_nerfstudio.evaluation.report import charts
+from sl_nerfstudio.evaluation.report.capture_reports import captures_of
 from sl_nerfstudio.evaluation.report.charts import (
     NO_SURFACE,
     NO_VALUE,
@@ -32,7 +33,7 @@ from sl_nerfstudio.evaluation.report.charts import (
     residual_colours,
     shrink,
 )
-from sl_nerfstudio.evaluation.report.view3d import SceneDevices, compressed_script, mesh_figure
+from sl_nerfstudio.evaluation.report.view3d import View, mesh_scene
 from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.parallel import results
@@ -171,6 +172,13 @@ def _change(record: dict[str, dict[str, float]]) -> IntrinsicsChange:
 
 
 _TEMPLATE = "report.html.j2"
+SECTIONS = {
+    "Accuracy": "surface", "Distance from reference": "surface", "Coverage": "surface", "Holes": "surface",
+    "Coordinate residual": "residuals", "Epipolar residual": "residuals", "Worst frame": "residuals",
+    "Worst frame, 95 %": "residuals", "Agreement in the worst frame": "residuals", "Ray angle": "residuals",
+    "Pattern agreement": "pattern", "Training": "training", "Sigma of lengths": "poses",
+}  # fmt: skip
+"""The section of the page in which a judged figure is shown: it is unfolded if the figure is not good."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +205,7 @@ class SurfacePictures:
     """Shaded views of the surface, with error colours where there is a reference."""
 
     views: list[str]  # data addresses
-    figure: str  # Plotly's JSON
+    view: View
     scale: ColourScale | None
     layers: list[str]  # names of what the interactive view can be coloured by
     histogram: str  # SVG, "" without a reference
@@ -206,8 +214,13 @@ class SurfacePictures:
 def render_report(report: ReportInput) -> str:
     """The page as text."""
     evaluation, scan = report.evaluation, report.inputs.scan
-    surface, comparisons, script, changes = _parts(report)
+    surface, comparisons, changes = _parts(report)
     frames, limit = evaluation.agreement.frames, 2 * evaluation.agreement.coordinate_px_median
+    outliers = {f.name for f in frames if not f.coordinate_px_median <= limit}
+    judged, record = report.judgement.figures, report.inputs.record
+    not_good = {SECTIONS[figure.name] for figure in judged if figure.band != "good"}
+    not_good |= {"residuals"} if outliers else set()
+    not_good |= {"poses"} if report.inputs.unplaced else set()
     residuals = [
         charts.Bars("coordinates", [f.coordinate_px_median for f in frames]),
         charts.Bars("epipolar", [f.epipolar_px_median for f in frames]),
@@ -228,30 +241,40 @@ def render_report(report: ReportInput) -> str:
         "epipolar_scale": EPIPOLAR,
         "pattern_scale": PATTERN,
         "residual_chart": charts.frame_bars("Median residuals by frame", "pattern px", residuals, wide=True),
-        "outliers": {f.name for f in frames if not f.coordinate_px_median <= limit},
+        "outliers": outliers,
+        "not_good": not_good,
+        "figures": _main_figures(report),
+        "good": sum(figure.band == "good" for figure in judged),
+        "bad_frames": [frame for frame in report.thumbnails if frame.name in outliers],
+        "good_frames": [frame for frame in report.thumbnails if frame.name not in outliers],
+        "captures": None if record is None else captures_of(record, scan.root / "processing.html"),
         "changes": changes,
         "lengths": report.lengths,
         "truth": [(name, errors) for name, errors in truth if errors is not None],
         "training": _training(report.inputs.training),
         "summary": _summary(report),
-        "plotly": script,
     }
     return page(_TEMPLATE, values)
 
 
-def _parts(report: ReportInput) -> tuple[SurfacePictures, list[Comparison], str, "PoseChanges | None"]:
+def _main_figures(report: ReportInput) -> list[tuple[str, str, str]]:
+    """As the console says them, each under its name."""
+    named = zip(MAIN_FIGURES, main_figures(report.evaluation, report.inputs.pose_sigma), strict=True)
+    return [(f"{name}: {before}" if before else name, value, after) for name, (before, value, after) in named]
+
+
+def _parts(report: ReportInput) -> tuple[SurfacePictures, list[Comparison], "PoseChanges | None"]:
     """What takes long, side by side. Matplotlib's settings belong to the process: one task draws with it at a time."""
     surface = IndexedMesh(report.inputs.mesh)
     compare = partial(compare_frames, surface, report.inputs.scan, report.evaluation.agreement, report.inputs.poses)
-    tasks: list[Callable[[], Any]] = [
-        partial(_surface_pictures, report, surface), partial(_pose_changes, report), compare, compressed_script,
-    ]  # fmt: skip
-    (pictures, errors), changes, comparisons, script = results(tasks)
+    pictures_of, changes_of = partial(_surface_pictures, report, surface), partial(_pose_changes, report)
+    tasks: list[Callable[[], Any]] = [pictures_of, changes_of, compare]
+    (pictures, errors), changes, comparisons = results(tasks)
     if errors is not None and pictures.scale is not None:
         title, units = "Signed distance of the surface from the reference", report.evaluation.truth_units
         histogram = charts.histogram(title, units, errors, pictures.scale.lower, pictures.scale.upper)
         pictures = replace(pictures, histogram=histogram)
-    return pictures, comparisons, script, changes
+    return pictures, comparisons, changes
 
 
 def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[SurfacePictures, Float[ndarray, "n"] | None]:
@@ -261,13 +284,15 @@ def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[Surfac
     views = camera_views(report.inputs.poses.T_world_camera, surface.centre)
     units = report.evaluation.truth_units
     layers = colour_layers(values, scale, report.inputs.quality, report.evaluation.units, units)
-    scan, quality = report.inputs.scan, report.inputs.quality
-    devices = SceneDevices([f.name for f in scan.frames], [f.camera for f in scan.frames], scan.projector)
+    quality = report.inputs.quality
     sigma = None if quality is None else quality.sigma
-    figure = mesh_figure(report.inputs.mesh, layers, report.inputs.poses, devices, sigma)
+    scan, record = report.inputs.scan, report.inputs.record
+    numbers = {frame.name: k for k, frame in enumerate(scan.frames)}
+    numbers |= {} if record is None else {frame.name: k for k, frame in enumerate(record.frames)}
+    view = mesh_scene(surface, layers, scan, report.inputs.poses, numbers, sigma, report.inputs.colour)
     errors = None if scale is None else _errors(report, surface, surface.sample(50_000, 0)[0])[0]
     drawn = [data_uri(render(surface, v, colours)) for v in views]
-    return SurfacePictures(drawn, figure, scale, [layer.name for layer in layers], ""), errors
+    return SurfacePictures(drawn, view, scale, [layer.name for layer in layers], ""), errors
 
 
 def _errors(

@@ -1,20 +1,27 @@
 """The report of sl-process shows every frame, and needs no network."""
 
 import re
+import shlex
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
+from sl_nerfstudio.evaluation.report.capture_reports import captures_of, render_processing_report
+from sl_nerfstudio.evaluation.report.view3d import placed_surface
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.triangulation import world_pixels
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.object_only import Preview, make_preview
-from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessResult
+from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessRecord, ProcessResult, read_record
 from sl_nerfstudio.processing.scan_poses import PlacedFrame, PlacedGroup
+from sl_nerfstudio.registration.result import parse_known_length
 from sl_nerfstudio.review.verdict import Verdict
+from sl_nerfstudio.scan.document import FileError
+from sl_nerfstudio.scan.write import encode_json
 
-from .pages import Page, figure_of, unpacked
+from .pages import Page, clicked, scene_of, unpacked
 
 CONFIG = ProcessConfig(Path("captures & more"), Path("pattern.json"), Path("intrinsics.json"), Path("scan"))
 GOOD = {"decode_rate": 0.93, "mask_share": 0.4, "epipolar_px": 0.31, "relative_sigma_rotation_deg": 0.12,
@@ -47,7 +54,8 @@ def test_everything_is_shown_and_escaped():
     assert "84.500" in page and "93 %" in page and ">0.31</td>" in page and "1.50 px before and 0.40 px after" in page
     assert 'aria-label="Overlap graph"' in page and "stroke-dasharray" in page
     assert not re.search(r"(src|href)=\"?https?:", page) and "default-src 'none'" in page  # the browser enforces it
-    assert 'id="plot"' not in page and 'id="plotly"' not in page  # nothing was placed
+    assert 'id="view"' not in page and 'id="scene"' not in page  # nothing was placed
+    assert page.index('id="frame-2"') < page.index('<div class="folded">') < page.index('id="frame-0"')  # the lost one
 
 
 @pytest.mark.parametrize("band", ["good", "acceptable", "poor"])
@@ -60,7 +68,11 @@ def test_the_verdict_and_its_reasons_come_first(band):
         '<li><a href="#frame-0">c</a>: contradicts &lt;the others&gt;</li><li><a href="#frame-1">d</a>: undecided</li>'
     )
     assert (linked in page) == (band != "good")
-    assert page.index("<strong>") < page.index('<section id="recapture">')
+    assert page.index('<section class="hero">') < page.index("<strong>") < page.index('<section id="not-good">')
+    assert Page(page).unfolded == {"figures": True, "overlaps": False, "frames": False, "settings": False}
+    alike = tuple(FrameRecord(name, **GOOD) for name in "cd")
+    well = render_processing_report(_result(alike), [Preview(None, None)] * 2)
+    assert not any(Page(well).unfolded.values()) and "nothing to capture again" in well
     assert "<td>undecided</td>" in page and ">0.83</td>" in page and "97 %" in page
     assert "half lie within 0.20 px and 95 % within 0.80 px" in page
 
@@ -100,8 +112,9 @@ def _placed(name, angle, points=5):
     T[:3, 3] = 5 * T[:3, 2]
     T_projector = T.copy()
     T_projector[:3, 3] += 0.5 * T[:3, 0]
-    p = np.random.default_rng(0).normal(size=(points, 3)).astype(np.float32) * 0.3
-    return PlacedFrame(name, CAMERA, PROJECTOR, T, T_projector, p, np.zeros((points, 2)))
+    p = np.random.default_rng(points).normal(size=(points, 3)) * 0.3
+    p = (p / np.linalg.norm(p, axis=1, keepdims=True)).astype(np.float32) if points > 100 else p.astype(np.float32)
+    return PlacedFrame(name, CAMERA, PROJECTOR, T, T_projector, p, world_pixels(CAMERA, T, p)[0])
 
 
 def _scene_page(**changes):
@@ -121,50 +134,118 @@ def _scene_page(**changes):
     )
 
 
+def _apexes(devices, group):
+    """The centres of projection of drawn devices: the first point of each pyramid's thirteen lines."""
+    return unpacked(devices["lines"], columns=3).reshape(-1, 26, 3)[:, 0] + group["origin"]
+
+
 def test_the_view_shows_every_group_with_devices_where_they_are():
-    page = render_processing_report(_scene_page(), [Preview(None, None)] * 6)
-    figure = figure_of(page)
-    menu, _ = figure["layout"]["updatemenus"]
-    assert [b["label"] for b in menu["buttons"]] == ["the scan: 3 frames", "group 1: 2 frames", "f by itself"]
-    names = [trace["name"] for trace in figure["data"]]
-    first = [
-        "surface of each frame",
-        "cameras",
-        "projectors",
-        "undecided frames",
-        "add a frame here",
-        "numbers of frames",
-    ]
-    assert names[: len(first)] == first
-    assert [trace["visible"] for trace in figure["data"]] == [True] * 6 + [False] * (len(names) - 6)
-    for k, button in enumerate(menu["buttons"]):  # each shows its own traces alone
-        shown = np.array(button["args"][0]["visible"])
-        assert shown.sum() == (6, 4, 4)[k] and shown.argmax() == (0, 6, 10)[k]
-        assert {"scene.camera", "scene.xaxis", "scene.aspectratio"} <= set(button["args"][1])
-    expected = {"cameras": ["a", "c"], "undecided frames": ["b", "b"]}
-    for name, wanted in expected.items():
-        trace = figure["data"][names.index(name)]
-        apex = np.stack([unpacked(trace[axis]) for axis in "xyz"], 1).reshape(len(wanted), -1, 3)[:, 0]
-        angle = {"a": 0.0, "b": 0.5, "c": 1.5}
-        centre = [5 * np.array([np.sin(angle[n]), 0, np.cos(angle[n])]) for n in wanted]
-        if name == "undecided frames":  # its camera, then its projector
-            centre[1] = centre[1] + 0.5 * np.array([np.cos(0.5), 0, -np.sin(0.5)])
-        np.testing.assert_allclose(apex, centre, atol=1e-5)
-    added = figure["data"][names.index("add a frame here")]
-    apex = np.array([unpacked(added[axis])[0] for axis in "xyz"])
-    points = np.concatenate([g.points for g in _scene_page().placed[0].frames]).astype(float)
+    scene = scene_of(render_processing_report(_scene_page(), [Preview(None, None)] * 6))
+    assert [group["name"] for group in scene["groups"]] == ["the scan: 3 frames", "group 1: 2 frames", "f by itself"]
+    first, lone = scene["groups"][0], scene["groups"][2]
+    cameras, undecided, projectors, also_undecided, added = first["devices"]
+    at = {n: 5 * np.array([np.sin(t), 0, np.cos(t)]) for n, t in (("a", 0.0), ("b", 0.5), ("c", 1.5))}
+    np.testing.assert_allclose(_apexes(cameras, first), [at["a"], at["c"]], atol=1e-5)
+    np.testing.assert_allclose(_apexes(undecided, first), [at["b"]], atol=1e-5)
+    beside = at["b"] + 0.5 * np.array([np.cos(0.5), 0, -np.sin(0.5)])
+    np.testing.assert_allclose(_apexes(also_undecided, first), [beside], atol=1e-5)
+    assert undecided["rgb"] == also_undecided["rgb"] not in (cameras["rgb"], projectors["rgb"])
+    assert [(one["text"], one["title"]) for one in cameras["labels"]] == [
+        ("0", "camera of frame 0: a"), ("2", "camera of frame 2: c"),
+    ]  # fmt: skip
+    np.testing.assert_allclose([one["at"] + np.array(first["origin"]) for one in cameras["labels"]], [at["a"], at["c"]])
+    points = np.concatenate([f.points for f in _scene_page().placed[0].frames]).astype(float)
+    np.testing.assert_allclose(unpacked(first["points"], columns=3) + first["origin"], points, atol=1e-5)
     centre = np.median(points, axis=0)
-    away = [5 * np.array([np.sin(t), 0, np.cos(t)]) - centre for t in (0.5, 1.5)]
+    away = [at["b"] - centre, at["c"] - centre]
     lengths = [np.linalg.norm(v) for v in away]
     between = away[0] / lengths[0] + away[1] / lengths[1]
+    apex = _apexes(added, first)[0]
     np.testing.assert_allclose(apex - centre, np.mean(lengths) * between / np.linalg.norm(between), atol=1e-4)
-    assert added["line"]["dash"] == "dash" and added["text"][0] == "add a frame here, between b and c"
+    assert added["labels"][0]["title"] == "add a frame here, between b and c"
+    assert unpacked(lone["frame"], "<i2").tolist() == [-1]  # nothing of the object: only the devices
 
 
 def test_unordered_captures_have_no_neighbours_between_which_to_add():
     config = ProcessConfig(Path("i"), Path("p"), Path("c"), Path("scan"), unordered=True)
-    page = render_processing_report(_scene_page(config=config), [Preview(None, None)] * 6)
-    assert "add a frame here" not in [trace["name"] for trace in figure_of(page)["data"]]
+    scene = scene_of(render_processing_report(_scene_page(config=config), [Preview(None, None)] * 6))
+    assert len(scene["groups"][0]["devices"]) == 4
+
+
+def test_discs_lie_in_the_surface_and_face_the_camera_that_saw_them():
+    group = PlacedGroup(0, (_placed("a", 0.0, 900), _placed("b", 0.5, 700)))  # points of a unit sphere
+    surface = placed_surface(group, {"a": 0, "b": 4})
+    eyes = np.array([frame.T_world_camera[:3, 3] for frame in group.frames])[surface.seen.frame]
+    np.testing.assert_allclose(np.abs((surface.normals * surface.points).sum(1)), 1, atol=0.05)
+    assert ((eyes - surface.points) * surface.normals).sum(1).min() > 0
+    assert (
+        (4 * np.pi / 1600) ** 0.5 < surface.radius < 3 * (4 * np.pi / 1600) ** 0.5
+    )  # they cover it, and not much more
+    assert set(surface.layers[0].values) == {0.0, 4.0}
+    many = PlacedGroup(0, tuple(_placed(str(k), 0.1 * k, 10_000) for k in range(13)))
+    assert 40_000 < len(placed_surface(many, {str(k): k for k in range(13)}).points) <= 60_000  # a page stays small
+
+
+@pytest.mark.parametrize("name", ["b", "it's $5 (new)"])
+def test_two_clicks_state_a_known_length_that_sl_process_understands(name):
+    """On a sphere before two cameras; `name` is of the second frame, which alone has points on the right."""
+    first, second = _placed("a", 0.0, 900), _placed(name, 0.3, 900)
+    left, right = first.points[:, 0] < 0, second.points[:, 0] >= 0
+    placed = PlacedGroup(0, (
+        replace(first, points=first.points[left], uv_camera=first.uv_camera[left]),
+        replace(second, points=second.points[right], uv_camera=second.uv_camera[right]),
+    ))  # fmt: skip
+    frames = (FrameRecord("a", **GOOD), FrameRecord(name, **GOOD))
+    page = render_processing_report(_result(frames, edges=(), placed=(placed,)), [Preview(None, None)] * 2)
+    assert "Click two points" in clicked(page)["said"] and not clicked(page, (0.27, 0.5))["known"]
+    assert clicked(page, (0.02, 0.5))["said"] == clicked(page)["said"]  # beside the object
+    found = clicked(page, (0.27, 0.5), (0.73, 0.5))
+    assert found["known"] and found["layers"] == ["shaded", "frames"]
+    flag, text = shlex.split(found["flag"])
+    known = parse_known_length(text)
+    assert (flag, known.metres, known.unit, set(known.frames)) == (
+        "--known-length",
+        pytest.approx(0.0755),
+        "mm",
+        {"a", name},
+    )
+    ends = []
+    for frame, pixel in zip(known.frames, known.pixels, strict=True):
+        one = placed.frames[frame == name]
+        off = np.abs(one.uv_camera - pixel).max(1)
+        near = np.flatnonzero(off < 0.051)  # said to a tenth of a pixel; the same pixel sees the far side, too
+        ends.append(one.points[near].astype(float))
+    said = float(re.search(r"Distance: ([\d.]+) mm", found["said"])[1])
+    lengths = np.linalg.norm(ends[0][:, None] - ends[1], axis=-1)
+    assert np.abs(lengths / said - 1).min() < 1e-3
+
+
+def test_another_report_has_the_captures_that_need_a_look_with_their_pictures(tmp_path):
+    lost = FrameRecord("d & <e>", False, stage="decoding", reason="is black\n    cause:  dark\n    remedy: light")
+    weak = FrameRecord("c", **{**GOOD, "degeneracies": ("flat",)})
+    result = _result((FrameRecord("a<b", **GOOD), weak, lost), recapture=("c: decoded badly", "between a<b and c: add"))
+    preview = make_preview(np.zeros((30, 40), np.uint8), None, (8, 8))
+    (tmp_path / "processing.json").write_bytes(encode_json(result.document()))
+    record = read_record(tmp_path / "processing.json")
+    assert record == ProcessRecord(**{one.name: getattr(result, one.name) for one in fields(ProcessRecord)})
+    report = tmp_path / "processing.html"
+    assert [row.image for row in captures_of(record, report).bad] == ["", ""]
+    report.write_text(render_processing_report(result, [preview] * 3))
+    found = captures_of(record, report)
+    assert [row.record.name for row in found.bad] == ["c", "d & <e>"] and found.good == []
+    assert all(row.image.startswith("data:image/webp") for row in found.bad)
+
+
+@pytest.mark.parametrize("change", [{"frames": 3}, {"overlaps": [{}]}, {"cross_frame_px": [1]}, {"verdict": None}])
+def test_a_damaged_record_is_refused(tmp_path, change):
+    document = _result((FrameRecord("a", **GOOD),)).document() | change
+    if change == {"verdict": None}:
+        del document["verdict"]
+    (tmp_path / "processing.json").write_bytes(encode_json(document))
+    with pytest.raises(
+        FileError, match=r"processing\.json: is not what sl-process writes(.|\n)*run the same sl-process"
+    ):
+        read_record(tmp_path / "processing.json")
 
 
 def test_links_lead_to_frames_and_pictures_can_be_enlarged():

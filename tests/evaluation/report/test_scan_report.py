@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from sl_nerfstudio.evaluation import judgement
 from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement, FramePixels
 from sl_nerfstudio.evaluation.evaluate import EvaluationInputs, Length, evaluate
 from sl_nerfstudio.evaluation.judgement import judge
@@ -20,6 +21,7 @@ from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import PointReference, mesh_reference
 from sl_nerfstudio.evaluation.report.charts import OrthographicView, draw_overlaps, render
 from sl_nerfstudio.evaluation.report.scan_report import (
+    SECTIONS,
     ReportInput,
     ResidualThumbnails,
     brightness_ratio,
@@ -30,14 +32,16 @@ from sl_nerfstudio.evaluation.report.scan_report import (
 from sl_nerfstudio.evaluation.report.view3d import decimated
 from sl_nerfstudio.geometry.devices import UNCHANGED, DeviceChange, IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.geometry.triangulation import world_pixels
 from sl_nerfstudio.meshing.mesh import VertexQuality
-from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord
+from sl_nerfstudio.processing.result import EdgeRecord, FrameRecord, ProcessRecord
+from sl_nerfstudio.review.verdict import Verdict
 from sl_nerfstudio.scan import PoseSigma, Scan, read_scan
 from tests.dataparser.tiny_scan import TinyScan
 
 from ..faceted_scan import CAMERA, FacetedScan
 from ..shapes import blob, sphere
-from .pages import Page, figure_of, unpacked
+from .pages import Page, clicked, scene_of, unpacked
 
 TRAINING = {
     "settings": {"method": "sl-neus", "model": {"refine_poses": "free", "note": "<script>alert(1)</script>"}},
@@ -53,6 +57,17 @@ TRAINING = {
         },
     },
 }
+
+RECORD = ProcessRecord(
+    decoder="network", units="mm", scale_source="", verdict=Verdict("acceptable", ("1 of 4 frames was left out",)),
+    frames=(
+        FrameRecord("lost <x>", False, stage="decoding", reason="shows nothing\n    cause:  dark"),
+        *(FrameRecord(f"frame_0000{k}", decode_rate=0.9, component=0, cross_px_p95=0.77) for k in range(3)),
+    ),
+    edges=(EdgeRecord(("frame_00000", "frame_00001"), 0.5, 0.9, True, False),),
+    remarks=(), recapture=("lost <x>: capture it again",), joint_px=(1.5, 0.4), cross_px=(0.21, 0.83), versions={},
+)  # fmt: skip
+"""Of the three frames of the scan, and of one that is not in it."""
 
 
 def text_of(page: str) -> str:
@@ -76,9 +91,11 @@ def full_report(clean_scan: Path) -> str:
     views = np.arange(count) % 3  # a third of the vertices is not observed
     stated = np.where(views > 0, 0.05, np.nan)
     quality = VertexQuality(stated, 0.5 * stated, views, 4 * stated, 300 * stated)
+    colour = np.arange(3 * count).reshape(count, 3).astype(np.uint8)
     inputs = EvaluationInputs(
-        truth, scan, moved, true, reference, path, [sigma, None, sigma], [scan.frames[1].name], TRAINING, quality
-    )
+        truth, scan, moved, true, reference, path, [sigma, None, sigma], [scan.frames[1].name], TRAINING, quality,
+        colour=colour, record=RECORD,
+    )  # fmt: skip
     end = (0.0, 0.0, 1.0)
     lengths = [
         Length("width <of> it", end, end, 12.3456, 0.0123, 0.0111, 0.0055, (3, 2)),
@@ -130,65 +147,89 @@ def test_report_tells_everything(full_report: str) -> None:
     ):  # fmt: skip
         assert what in text, what
     assert "<script>alert(1)" not in full_report  # only escaped
-    assert full_report.count('class="maps"') == 3
+    assert full_report.count('class="maps"') == 4  # and of the capture that was left out
+
+
+def test_the_object_the_verdict_and_three_figures_come_first_and_what_is_good_is_folded(full_report: str) -> None:
+    hero = full_report.index('<section class="hero">')
+    assert hero < full_report.index('id="view"') < full_report.index("<dl>") < full_report.index('id="not-good"')
+    text = text_of(full_report)
+    assert text.index("coordinates agree to") < text.index("What is not good") < text.index("Every judged figure")
+    judged = re.findall(r'<tr class="(\w+)"><th scope="row">([^<]+)</th>', full_report)
+    assert {name for _, name in judged} <= SECTIONS.keys() and "good" in {band for band, _ in judged}
+    unfolded = {SECTIONS[name] for band, name in judged if band != "good"} | {"poses"}  # a frame could not be placed
+    found = Page(full_report).unfolded
+    sections = set(SECTIONS.values()) | {"scan"}
+    assert {name for name in sections if found[name]} == unfolded | (
+        {"residuals"} if ">outlier<" in full_report else set()
+    )
+    assert found["figures"] and not found["overlaps"] and not found["judgement"]  # a capture was left out
+
+
+def test_the_captures_half_says_what_processing_said(full_report: str) -> None:
+    text = text_of(full_report)
+    for what in ("0: lost <x> left out", "shows nothing cause: dark", "lost <x>: capture it again", "no: decoding",
+                 "1.50 px before and 0.40 px after", "half lie within 0.21 px and 95 % within 0.83 px"):  # fmt: skip
+        assert what in text, what
+    assert full_report.count('<td class="n">0.77</td>') == 3 and text.index("0: lost <x>") < text.index(
+        "Every judged figure"
+    )
+
+
+def test_every_judged_figure_has_a_section() -> None:
+    source = Path(judgement.__file__).read_text()
+    names = re.findall(r'(?:judged|WorstFrameFigure)\(\n\s+"([^"]+)"', source) + ["Accuracy", "Distance from reference"]
+    assert set(names) | {"Coverage"} == set(SECTIONS)
 
 
 def test_interactive_surface_is_complete(full_report: str) -> None:
-    figure = figure_of(full_report)
-    assert [trace["name"] for trace in figure["data"]] == ["surface", "cameras", "projectors", "measured"]
-    menu, views = figure["layout"]["updatemenus"]
-    assert [button["label"] for button in views["buttons"]] == ["object", "all devices"]
-    names = ["error", "uncertainty (1 sigma)", "views", "residual", "ray angle"]
-    assert [button["label"] for button in menu["buttons"]] == names
-    changes = [button["args"][0] for button in menu["buttons"]]
-    count = len(FacetedScan().truth().vertices)
-    assert all(len(change["intensity"][0]) == count and button["args"][1] == [0]
-               for change, button in zip(changes, menu["buttons"], strict=True))  # fmt: skip
-    assert changes[0]["intensity"][0] == figure["data"][0]["intensity"]
-    sigma, views = (np.array(changes[k]["intensity"][0]) for k in (1, 2))
+    scene = scene_of(full_report)
+    (surface,) = scene["groups"]
+    truth = FacetedScan().truth()
+    count = len(truth.vertices)
+    np.testing.assert_allclose(unpacked(surface["points"], columns=3) + surface["origin"], truth.vertices, atol=1e-4)
+    np.testing.assert_array_equal(unpacked(surface["faces"], "<u4", 3), truth.faces)
+    layers = {layer["name"]: layer for layer in surface["layers"]}
+    assert list(layers) == ["error", "uncertainty (1 sigma)", "views", "residual", "ray angle"]
+    assert [layer["units"] for layer in layers.values()] == ["mm", "mm", "frames", "px", "degrees"]
+    sigma, views = unpacked(layers["uncertainty (1 sigma)"]["values"]), unpacked(layers["views"]["values"])
     assert np.array_equal(views, np.arange(count) % 3)
-    assert np.allclose(sigma[views > 0], 0.05) and (sigma[views == 0] > changes[1]["cmax"]).all()  # marked
-    assert [change["colorbar.title.text"] for change in changes] == ["mm", "mm", "frames", "px", "degrees"]
-    stated = unpacked(figure["data"][0]["customdata"])  # of the ends of a measured line
-    np.testing.assert_allclose(stated, np.where(np.arange(count) % 3 > 0, 0.05, np.nan), rtol=1e-6)
+    assert np.allclose(sigma[views > 0], 0.05) and (sigma[views == 0] > layers["uncertainty (1 sigma)"]["upper"]).all()
+    np.testing.assert_allclose(unpacked(surface["sigma"]), np.where(np.arange(count) % 3 > 0, 0.05, np.nan), rtol=1e-6)
+    np.testing.assert_array_equal(unpacked(surface["colour"], "u1"), np.arange(3 * count).astype(np.uint8))
+    assert clicked(full_report)["layers"] == ["its colours", "shaded", *layers]  # its colours, or else clay, come first
+    numbers = [(one["text"], one["title"]) for one in surface["devices"][0]["labels"]]
+    assert numbers == [(str(k + 1), f"camera of frame {k + 1}: frame_0000{k}") for k in range(3)]  # among the captures
 
 
 def test_pyramids_stand_where_the_devices_do_and_open_towards_what_they_see(full_report: str) -> None:
-    figure, made = figure_of(full_report), FacetedScan()
+    (surface,), made = scene_of(full_report)["groups"], FacetedScan()
     true = made.true_poses()
     true.T_world_camera[1, :3, 3] += 0.5  # as in the report
-    for trace, T, device in ((1, true.T_world_camera, CAMERA), (2, true.T_world_projector, made.projector)):
-        drawn = np.stack([unpacked(figure["data"][trace][axis]) for axis in "xyz"], 1).reshape(3, -1, 3)
-        assert np.isnan(drawn[:, -1]).all()  # the gap to the next one
-        np.testing.assert_allclose(drawn[:, 0], T[:, :3, 3], rtol=1e-5)
+    views = (true.T_world_camera, CAMERA), (true.T_world_projector, made.projector)
+    for (T, device), shown in zip(views, surface["devices"], strict=True):
+        drawn = unpacked(shown["lines"], columns=3).reshape(3, 26, 3)
+        np.testing.assert_allclose(drawn[:, 0] + surface["origin"], T[:, :3, 3], atol=1e-4)
         ray = np.array([-device.cx / device.fl_x, device.cy / device.fl_y, -1.0])  # of the upper left corner
         side = drawn[:, 1] - drawn[:, 0]
         expected = np.einsum("nij,j->ni", T[:, :3, :3], ray / np.linalg.norm(ray))
         np.testing.assert_allclose(side / np.linalg.norm(side, axis=1, keepdims=True), expected, atol=1e-4)
-        assert figure["data"][trace]["text"][0].endswith("of frame 0: frame_00000")
 
 
-def test_the_view_of_all_devices_shows_all_of_them(full_report: str) -> None:
-    """By the way of Plotly: axes onto the aspect ratio, then a pinhole of 45 degrees, looking at the centre."""
-    figure = figure_of(full_report)
-    scene = figure["layout"]["scene"]
-    low, high = (np.array([scene[f"{axis}axis"]["range"][k] for axis in "xyz"]) for k in (0, 1))
-    ratio = np.array([scene["aspectratio"][axis] for axis in "xyz"])
-    np.testing.assert_allclose(ratio / (high - low), (ratio / (high - low))[0])  # of equal scale
-    shown = {}
-    for button in figure["layout"]["updatemenus"][1]["buttons"]:
-        camera = {k: np.array([v[axis] for axis in "xyz"]) for k, v in button["args"][0]["scene.camera"].items()}
-        back = camera["eye"] - camera["center"]
-        back /= np.linalg.norm(back)
-        right = np.cross(camera["up"], back)
-        right /= np.linalg.norm(right)
-        for number, trace in enumerate(figure["data"][:3]):
-            p = np.stack([unpacked(trace[axis]) for axis in "xyz"], 1)
-            p = (p[np.isfinite(p).all(1)] - low) / (high - low) * ratio - ratio / 2 - camera["eye"]
-            edge = np.abs(np.stack([p @ right / (1030 / 560), p @ np.cross(back, right)], 1) / -(p @ back)[:, None])
-            shown[button["label"], number] = (edge.max() / np.tan(np.pi / 8)) * (1 if (p @ back < 0).all() else np.inf)
-    assert shown["object", 0] < 1 and max(shown["all devices", k] for k in range(3)) < 1
-    assert max(shown["all devices", k] for k in range(3)) > 0.85 and shown["object", 0] > 0.85  # and not far away
+def test_points_are_where_a_frame_decoded_them(full_report: str, clean_scan: Path) -> None:
+    (surface,), scan = scene_of(full_report)["groups"], read_scan(clean_scan)
+    true = FacetedScan().true_poses()
+    true.T_world_camera[1, :3, 3] += 0.5
+    points = unpacked(surface["points"], columns=3) + surface["origin"]
+    frame, uv = unpacked(surface["frame"], "<i2"), unpacked(surface["uv"], columns=2)
+    assert surface["names"] == [one.name for one in scan.frames] and (frame >= 0).mean() > 0.3
+    for k, one in enumerate(scan.frames):
+        seen = frame == k
+        pixel, inside = world_pixels(one.camera, true.T_world_camera[k], points[seen])
+        assert inside.all()
+        np.testing.assert_allclose(uv[seen], pixel, atol=1e-2)
+        column, row = np.floor(pixel).astype(int).T
+        assert np.isfinite(one.read_coords()[row, column]).all()
 
 
 @pytest.mark.parametrize("with_points", [False, True])
