@@ -26,11 +26,14 @@ def launch(kernel: Any, programs: int | tuple[int, int], *arguments: Tensor | fl
     """Queue a kernel on its tensors' GPU, on torch's current stream.
 
     Nothing is allocated and nothing waits, so that a CUDA graph can capture it once it was compiled. Without programs
-    nothing is done. The constants are part of the compiled kernel, as is `num_warps`.
+    nothing is done. The constants are part of the compiled kernel, as is `num_warps`. Tensors must have no gaps, unless
+    the kernel has STRIDES.
     """
     grid = (programs,) if isinstance(programs, int) else programs
     if 0 in grid:
         return
+    dense = "STRIDES" in constants or all(x.is_contiguous() for x in arguments if isinstance(x, Tensor))
+    assert dense, f"{name_of(kernel)}: a tensor with gaps"
     for watcher in _watchers:
         watcher(name_of(kernel))
     run(kernel, grid, arguments, constants)

@@ -134,13 +134,14 @@ def begin_rays(
     index, among, frame, row, column, coords, pattern, T_cameras, cameras, T_projectors, projector,
     noise, cache, kappa, noise_px, px_per_length,
     views, origins, directions, measured, captured, t, points, weight, at_least,
-    rays, rendered, others, resolution,
+    rays, rendered, others, resolution, STRIDES: tl.constexpr,
     AMONG: tl.constexpr, CAMERA_DOE: tl.constexpr, CAMERA_DISTORTED: tl.constexpr, DOE: tl.constexpr,
     DISTORTED: tl.constexpr, RENDERS: tl.constexpr, SURFACE: tl.constexpr, DIRECT: tl.constexpr,
     HALF_WIDTH: tl.constexpr, SAMPLES: tl.constexpr, COLUMNS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """Rays of the pixels `index` of a table (of its rows `among`, if AMONG), what was measured there, and all points.
 
+    STRIDES are those of the table's five columns, from one pixel to the next.
     `at_least` is the value that the field should have in front of the triangulated points, `weight` what these count.
     """
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
@@ -151,17 +152,20 @@ def begin_rays(
     pixel = tl.load(index + i, there, 0)
     if AMONG:
         pixel = tl.load(among + pixel, there, 0)
-    view = tl.load(frame + pixel, there, 0)
+    pixel = pixel.to(tl.int64)
+    view = tl.load(frame + pixel * STRIDES[0], there, 0)
     T = pose(T_cameras, view, there)
-    x, y = tl.load(column + pixel, there, 0).to(tl.float32) + 0.5, tl.load(row + pixel, there, 0).to(tl.float32) + 0.5
+    y = tl.load(row + pixel * STRIDES[1], there, 0).to(tl.float32) + 0.5
+    x = tl.load(column + pixel * STRIDES[2], there, 0).to(tl.float32) + 0.5
+    coords += pixel * STRIDES[3]
     o, d = T[3], turned(T, unproject(intrinsics(cameras, view, there), x, y, CAMERA_DOE, CAMERA_DISTORTED))
-    u, v = tl.load(coords + 2 * pixel, there, 0.0), tl.load(coords + 2 * pixel + 1, there, 0.0)
+    u, v = tl.load(coords, there, 0.0), tl.load(coords + 1, there, 0.0)
     tl.store(views + i, view, there)
     store(origins, i, o, there)
     store(directions, i, d, there)
     tl.store(measured + 2 * i, u, there)
     tl.store(measured + 2 * i + 1, v, there)
-    tl.store(captured + i, tl.load(pattern + pixel, there, 0.0).to(tl.float32), there)
+    tl.store(captured + i, tl.load(pattern + pixel * STRIDES[4], there, 0.0).to(tl.float32), there)
     low, high = near_and_far(o, d)
     if DIRECT:
         k, T = intrinsics(projector, 0, True), pose(T_projectors, view, there)
@@ -590,6 +594,7 @@ class _Points(torch.autograd.Function):
         scalars = (current.kappa, current.noise_px, current.px_per_length)
         found = (views, origins, directions, measured, captured, t, points, weight, at_least)
         constants = {
+            "STRIDES": tuple(column.stride(0) for column in table[2:]),
             "AMONG": len(x.among) > 0, "CAMERA_DOE": devices.cameras.model == "DOE",
             "CAMERA_DISTORTED": devices.cameras.distorted, "RENDERS": r > 0, "DIRECT": n > 0,
             "SURFACE": step.sampling.strategy == "surface", "HALF_WIDTH": HALF_WIDTH,
@@ -660,7 +665,8 @@ class _Losses(torch.autograd.Function):
 def _along_rays(step: Step, kernel: Any, n: int, *arguments: Any, **constants: Any) -> None:
     """Launch a kernel for n rays, each with its samples."""
     columns = triton.next_power_of_2(step.sampling.samples)
-    size = block(max(_ELEMENTS // columns, 1), n)
+    widest = max(columns, _CACHE_SAMPLES.value if kernel is begin_rays else 1)
+    size = block(max(_ELEMENTS // widest, 1), n)
     projector = step.devices.projector
     if kernel is not rays_adjoint:
         constants |= {"DOE": projector.model == "DOE", "DISTORTED": projector.distorted}

@@ -32,13 +32,13 @@ def adjusted_at_once(scan, S_scene_world, samples, refine, prior, settings):
     "method, refine, poses, backend",
     [
         ("sl-neus", "off", "adjust", "torch"),  # fixed
-        ("sl-neus", "free", "adjust", "warp"),  # refined before the first step
-        ("sl-neus", "rigid-rig", "render", "warp"),  # trained
+        ("sl-neus", "free", "adjust", "triton"),  # refined before the first step
+        ("sl-neus", "rigid-rig", "render", "triton"),  # trained
         ("sl-neus-paper", "free", "render-independently", "torch"),
     ],
 )
 def test_no_step_waits_for_the_gpu(begin, monkeypatch, method, refine, poses, backend):
-    with PretendedGpu(kernels=backend == "warp") as gpu:
+    with PretendedGpu(kernels=backend == "triton") as gpu:
         training = begin(method, partial(with_poses, refine, poses, backend))
         if refine == "free" and poses == "adjust":
             monkeypatch.setattr("sl_nerfstudio.model.model.adjust_scan", adjusted_at_once)
