@@ -23,7 +23,6 @@ _EXTRAS = {
     "phone": "photographs of phones (.heic)",
     "video": "captures from a video",
     "las": "point clouds for surveying programs (sl-export --points cloud.las)",
-    "cuda": "the field's own kernels on NVIDIA GPUs",
 }
 _GROUPS = {"nerfstudio.method_configs": "methods", "nerfstudio.dataparser_configs": "dataparsers"}
 _AGREE = 1e-4  # scene units; the backends differ by rounding, some 1e-7
@@ -135,9 +134,9 @@ def backends() -> str:
         small.backend = "torch"
         if torch.cuda.is_available():
             values["torch on cuda"] = field.to("cuda").sdf(points.to("cuda")).cpu()
-            if field.obstacle("warp") is None:
-                small.backend = "warp"
-                values["warp on cuda"] = field.sdf(points.to("cuda")).cpu()
+            if field.obstacle("triton") is None:
+                small.backend = "triton"
+                values["triton on cuda"] = field.sdf(points.to("cuda")).cpu()
     worst = {name: float((value - values["torch on cpu"]).abs().max()) for name, value in values.items()}
     wrong = [name for name, difference in worst.items() if not difference < _AGREE]
     if wrong:

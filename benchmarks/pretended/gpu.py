@@ -259,7 +259,8 @@ class PretendedGpu(TorchDispatchMode):
         if not others:
             return
         if name_of(func) == "copy_":
-            self.wait("a copy between host and device")
+            if not (len(args) > 2 and args[2] and all(getattr(x, "pinned", False) for x in others)):
+                self.wait("a copy between host and device")
             return
         if indexes(func) and isinstance(args[0], DeviceTensor):
             mine = {id(x) for x in args[1] if x is not None}
@@ -308,7 +309,9 @@ class _Functions(TorchFunctionMode):
         if name in ("tensor", "as_tensor"):
             made = func(*(on_cpu(x) if name == "as_tensor" else x for x in args), **kwargs)
             return self._upload(made) if wanted_there else made
+        pinned = kwargs.pop("pin_memory", False)
         made = func(*args, **kwargs)
+        made.pinned = pinned
         if not wanted_there:
             return self._read(made) if isinstance(made, DeviceTensor) else made
         if not isinstance(made, DeviceTensor):

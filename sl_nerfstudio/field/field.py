@@ -102,8 +102,8 @@ class FieldConfig:
     max_resolution: int = 256
     """Cells per axis of the grid's finest level; levels grow geometrically, by 2 with the default."""
     backend: BackendName = "auto"
-    """numba: compiled for this CPU; triton: kernels for GPUs; torch: any device and precision; auto: numba on the CPU and
-    triton on GPUs, wherever they work."""
+    """numba: compiled for this CPU; triton: kernels for GPUs; torch: any device and precision; auto: numba on the CPU
+    and triton on GPUs, wherever they work."""
     levels: tyro.conf.Suppress[int] = 5
     """Levels of the feature grid."""
     log2_table_size: tyro.conf.Suppress[int] = 19

@@ -170,8 +170,8 @@ def scatter(
 
 
 # The activation `knee`, a ReLU with a rounded corner of half-width `w`: with `t = clamp((z + w) / 2 w, 0, 1)` it is
-# `w t^3 (2 - t) + max(z - w, 0)`, its slope is `t^2 (3 - 2 t)`, and its second derivative `3 t (1 - t) / w`. The kernels
-# take rows of H numbers, the width of a hidden layer, in tiles of BLOCK rows and COLUMNS >= H columns.
+# `w t^3 (2 - t) + max(z - w, 0)`, its slope is `t^2 (3 - 2 t)`, and its second derivative `3 t (1 - t) / w`. The
+# kernels take rows of H numbers, the width of a hidden layer, in tiles of BLOCK rows and COLUMNS >= H columns.
 
 
 @triton.jit

@@ -4,7 +4,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from sl_nerfstudio.dataparser.datamanager import SLPixelSampler
 from sl_nerfstudio.dataparser.dataparser import PixelSamples
+from sl_nerfstudio.field.hash_grid import FEATURES
+from sl_nerfstudio.field.triton_backend import step_table
 from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.poses import PoseParameters
 from sl_nerfstudio.rendering.triton_poses import Moves, moved_poses
@@ -25,6 +28,17 @@ def kernel_step(
     found = step_losses(model.field, step, *device_poses(model.device_poses))
     metrics = {"coordinate_px": found.coordinate_px, "pattern_cosine": found.pattern_cosine}
     return found.terms, {name: value for name, value in metrics.items() if value is not None}
+
+
+def compile_kernels(model: SLModel, sampler: SLPixelSampler) -> None:
+    """Compile all kernels of a training: by steps whose gradients are forgotten, and one of a table of zeros."""
+    for renders in {model.renders_now, True}:
+        terms, _ = kernel_step(model, sampler.samples, sampler.choose(0), renders)
+        torch.stack(list(terms.values())).sum().backward()
+    model.zero_grad(set_to_none=True)
+    zeros = model.field.encoding.table.new_zeros
+    rows = (zeros(16, FEATURES), zeros(16, FEATURES), zeros(16, 2, FEATURES), zeros(16))
+    step_table(*rows, zeros(1), betas=(0.9, 0.99), most_steps=1, eps=1.0)
 
 
 def device_poses(poses: PoseParameters) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:

@@ -116,7 +116,7 @@ def test_what_the_backend_cannot_do_is_said_when_it_is_chosen_by_hand(monkeypatc
     with pytest.raises(UserError, match=r"computes in float32, the field is torch\.float64"):
         make_field("triton", torch.float64).sdf(p)
     monkeypatch.setattr(device_kernels, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match="needs the package triton, which comes with torch on Linux; choose the backend"):
+    with pytest.raises(UserError, match="needs the package triton, which comes with torch on Linux; choose"):
         make_field("triton").sdf(p.float())
     monkeypatch.setattr(device_kernels, "INTERPRETED", False)
     with pytest.raises(UserError, match="runs on a GPU; on the CPU only with TRITON_INTERPRET=1"):
@@ -137,7 +137,7 @@ def test_a_triton_that_does_not_work_is_said_and_plain_torch_is_used(
     def fails(*_: Any) -> None:
         raise error
 
-    field, p = make_field("triton"), points_around(10).float()
+    field = make_field("triton")
     monkeypatch.setattr(device_kernels, "run", fails)
     device_kernels._tried.cache_clear()
     try:

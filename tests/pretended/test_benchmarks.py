@@ -17,7 +17,7 @@ def test_launches_and_waits_of_a_step_are_counted(tiny_root, tmp_path, capsys, m
     output = tmp_path / "launches.json"
     config = launches.Config(tiny_root, ("paper",), ("triton",), rays=16, output=output)
     (row,) = launches.main(config)
-    assert row.waits == 0 and 0 < row.of_warp < row.launches <= row.most < 100
+    assert row.waits == 0 and 0 < row.of_triton < row.launches <= row.most < 100
     assert row.with_graph < 20 and row.between < 5
     assert json.loads(output.read_text())["rows"][0]["launches"] == row.launches == sum(row.by_name.values())
     assert "triton encode" in capsys.readouterr().out
