@@ -4,18 +4,15 @@
 
 Steps of the methods run on a pretended GPU (benchmarks/pretended): tensors say that they are on it and hold their
 values on the CPU, and every operation is counted where torch hands it to a device. Kernels in Triton are counted, too,
-and run by its interpreter. A large operation of torch, such as a sort, may launch several kernels. Recorded as a CUDA
+but do not run, so figures of a training mean nothing here. A large operation of torch, such as a sort, may launch several kernels. Recorded as a CUDA
 graph, a step is one launch, besides those that set its scalars. What the loop does after a step is counted with it.
 """
 
-import os
 import tempfile
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
-
-os.environ["TRITON_INTERPRET"] = "1"  # before kernels are imported
 
 import torch
 
@@ -61,7 +58,7 @@ class Row:
 
 def count(size: str, backend: Backend, config: Config) -> Row:
     """Take some steps, all terms and all levels in use, and count."""
-    with PretendedGpu(kernels=backend == "triton") as gpu, tempfile.TemporaryDirectory() as folder:
+    with PretendedGpu(kernels=backend == "triton", dry=True) as gpu, tempfile.TemporaryDirectory() as folder:
         run = settings(METHODS[size], _scan(config), Path(folder), "cuda", 1000)
         run.cuda_graph = False
         model_of(run).sdf.backend = backend

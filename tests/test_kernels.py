@@ -31,7 +31,7 @@ def test_all_kernels_compile_for_three_architectures_with_few_registers_and_no_s
         assert {row["kernel"] for row in rows if row["architecture"] == architecture} == names
     defined = {
         node.name
-        for file in ("field/triton_backend.py", "rendering/triton_poses.py", "rendering/triton_step.py")
+        for file in ("field/triton_backend.py", "rendering/triton_poses.py", "rendering/triton_kernels.py")
         for node in ast.parse((PACKAGE / file).read_text()).body
         if isinstance(node, ast.FunctionDef) and node.decorator_list and not node.name.startswith("_")
     }

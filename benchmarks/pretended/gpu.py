@@ -153,13 +153,17 @@ class Seen:
 class PretendedGpu(TorchDispatchMode):
     """Use as a context. `seen` counts from the start or from the last `counting()`."""
 
-    def __init__(self, kernels: bool = False) -> None:
-        """`kernels`: those in Triton run, too, interpreted; otherwise none can be compiled."""
+    def __init__(self, kernels: bool = False, dry: bool = False) -> None:
+        """`kernels`: those in Triton run, too, interpreted; otherwise none can be compiled.
+
+        If `dry`, they are only counted: what they should have written is left as it was.
+        """
         super().__init__()
         self.seen = Seen()
         self.on_kernel: list[Callable[[Callable[[], None]], None]] = []
         """Told of every kernel in Triton, as what runs it again."""
         self._kernels = kernels
+        self._dry = dry
         self._functions = _Functions(self)
         self.works_there = False  # in an operation on the GPU, whose parts torch makes where it believes to be
         self.calls_factory = False  # for our own code, which says where
@@ -224,7 +228,11 @@ class PretendedGpu(TorchDispatchMode):
         if any(there) and not all(there):
             at = [f"{x.device} {tuple(x.shape)}" for x in tensors]
             raise MixedDevicesError(f"{device_kernels.name_of(kernel)}: {at}")
-        work = partial(_interpret, kernel, grid, tuple(on_cpu(x) for x in arguments), constants)
+        work = (
+            (lambda: None)
+            if self._dry
+            else partial(_interpret, kernel, grid, tuple(on_cpu(x) for x in arguments), constants)
+        )
         work()
         if any(there):
             self.seen.launches[f"triton {device_kernels.name_of(kernel)}"] += 1

@@ -68,8 +68,6 @@ def obstacle(device: torch.device) -> str | None:
     """Why kernels cannot run on a device, or None if they can. The first call for a GPU compiles a tiny one."""
     if device.type == "cpu" and not INTERPRETED:
         return "the triton backend runs on a GPU; on the CPU only with TRITON_INTERPRET=1 in the environment"
-    if find_spec("triton") is None:
-        return "the triton backend needs the package triton, which comes with torch on Linux"
     return _failures[0] if _failures else _tried(device)
 
 
@@ -81,6 +79,8 @@ def give_up(error: BaseException) -> str:
 
 @cache
 def _tried(device: torch.device) -> str | None:
+    if find_spec("triton") is None:
+        return "the triton backend needs the package triton, which comes with torch on Linux"
     try:
         from sl_nerfstudio.field.triton_vectors import probe
 

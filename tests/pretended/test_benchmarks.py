@@ -6,7 +6,6 @@ import pytest
 
 from benchmarks import gpu, launches
 from benchmarks.common.training import settings
-from sl_nerfstudio.dataparser.dataparser import load_scan
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 
@@ -35,18 +34,18 @@ def test_everything_about_a_gpu_can_be_tried_on_the_cpu(tiny_root, tmp_path, mon
 
     monkeypatch.chdir(tmp_path)
     for name, stand_in in {
-        "made_once": lambda *_: load_scan(tiny_root),
         "settings": small,
         "encoding_times": lambda *_: 1 / 0,
         "rmse": lambda *_: {"rmse_mm": 0.1},
     }.items():
         monkeypatch.setattr(gpu, name, stand_in)
-    only = ("step paper numba", "surface paper cpu", "encoding lean nerfstudio")
-    config = gpu.Config("cpu", steps=1, compared_steps=1, only=only)
+    only = ("kernels", "step paper numba", "surface paper cpu", "encoding lean nerfstudio")
+    config = gpu.Config("cpu", tiny_root, steps=1, compared_steps=1, only=only)
     found = gpu.main(config)
-    assert found["step paper numba"]["ms"] > 0 and found["surface paper cpu"]["rmse_mm"] == 0.1
+    assert max(found["kernels"]["numba"]) < 1e-4
+    assert found["step paper numba"]["loop_ms"] > 0 and found["surface paper cpu"]["rmse_mm"] == 0.1
     assert found["encoding lean nerfstudio torch"]["error"] == "division by zero"  # the others are still measured
     assert json.loads((tmp_path / config.output).read_text()) == found
     names = set(gpu.parts(gpu.Config(), tmp_path))  # on a GPU
-    assert {"step paper warp graph", "step default torch", "surface default cuda", "surface default cpu"} <= names
+    assert {"step paper triton graph", "step default torch", "surface default cuda", "surface default cpu"} <= names
     assert "surface paper 10000 steps" in names and "encoding paper nerfstudio torch" in names
