@@ -4,8 +4,9 @@
 
 Steps of the methods run on a pretended GPU (benchmarks/pretended): tensors say that they are on it and hold their
 values on the CPU, and every operation is counted where torch hands it to a device. Kernels in Triton are counted, too,
-but do not run, so figures of a training mean nothing here. A large operation of torch, such as a sort, may launch several kernels. Recorded as a CUDA
-graph, a step is one launch, besides those that set its scalars. What the loop does after a step is counted with it.
+but do not run, so figures of a training mean nothing here. A large operation of torch, such as a sort, may launch
+several kernels. Recorded as a CUDA graph, a step is one launch, besides those that set its scalars. What the loop does
+after a step is counted with it.
 """
 
 import tempfile

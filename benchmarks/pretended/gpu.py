@@ -228,15 +228,12 @@ class PretendedGpu(TorchDispatchMode):
         if any(there) and not all(there):
             at = [f"{x.device} {tuple(x.shape)}" for x in tensors]
             raise MixedDevicesError(f"{device_kernels.name_of(kernel)}: {at}")
-        work = (
-            (lambda: None)
-            if self._dry
-            else partial(_interpret, kernel, grid, tuple(on_cpu(x) for x in arguments), constants)
-        )
-        work()
+        work = partial(_interpret, kernel, grid, tuple(on_cpu(x) for x in arguments), constants)
+        if not self._dry:
+            work()
         if any(there):
             self.seen.launches[f"triton {device_kernels.name_of(kernel)}"] += 1
-            for told in self.on_kernel:
+            for told in [] if self._dry else self.on_kernel:
                 told(work)
 
     def wait(self, why: str) -> None:

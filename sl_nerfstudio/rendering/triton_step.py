@@ -195,14 +195,12 @@ class _Losses(torch.autograd.Function):
         f, slopes, *_ = tensors
         r, sums, found, error = step.rendered, zeros.sums, f.new_empty(7), f.new_empty(step.rendered)
         if r:
-            _along_rays(
-                step, kernels.render, r, *_rendering(step, tensors), error, sums, r, *step.devices.pattern.shape
-            )
+            outputs = (error, sums, r, *step.devices.pattern.shape)
+            _along_rays(step, kernels.render, r, *_rendering(step, tensors), *outputs)
             error = error.sort().values
         size = block(_POINTS, len(slopes))
-        launch(
-            kernels.direct, triton.cdiv(len(slopes), size), *_on_points(step, tensors), sums, *_counts(step), BLOCK=size
-        )
+        arrays = (*_on_points(step, tensors), sums, *_counts(step))
+        launch(kernels.direct, triton.cdiv(len(slopes), size), *arrays, BLOCK=size)
         constants = {**_coordinate_weights(step.losses), **_weights_of(step.losses), "PATTERN": step.losses.pattern}
         launch(kernels.losses, 1, sums, step.current.px_per_length, error, found, **constants, num_warps=1)
         ctx.step, ctx.zeros = step, zeros
