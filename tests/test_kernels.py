@@ -16,7 +16,7 @@ PACKAGE = ROOT / "sl_nerfstudio"
 
 
 @pytest.mark.slow
-def test_all_kernels_compile_for_three_architectures_with_few_registers_and_no_spills(tmp_path: Path) -> None:
+def test_all_kernels_compile_for_three_architectures_with_few_registers_and_hardly_a_spill(tmp_path: Path) -> None:
     scan, output = TinyScan(undecoded=0.2).write(tmp_path / "sphere"), tmp_path / "kernels.json"
     command = [sys.executable, "-m", "benchmarks.kernels", "--scan", scan, "--output", output]
     environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
@@ -25,8 +25,11 @@ def test_all_kernels_compile_for_three_architectures_with_few_registers_and_no_s
     names = {row["kernel"] for row in rows}
     for row in rows:
         assert row["registers"] <= 128 and row["spills"] <= 16, row
-        if row["kernel"] in ("encode", "to_points", "scatter", "row_adam"):
-            assert row["vectors"] >= 8, row  # rows of eight features are read as two vectors of four
+        if row["kernel"] in ("encode", "to_points", "row_adam") or (row["kernel"], row["architecture"]) == (
+            "scatter",
+            90,
+        ):
+            assert row["vectors"] >= 8, row  # rows of eight features are read, and on sm_90 added, as two vectors
     for architecture in (80, 89, 90):
         assert {row["kernel"] for row in rows if row["architecture"] == architecture} == names
     defined = {

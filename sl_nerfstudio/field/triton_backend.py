@@ -372,7 +372,7 @@ class TritonField:
             grid = (triton.cdiv(n, size), self.layout.levels)
             arrays = (state.places, state.level_weights, p, by_encoded, v, table_gradient)
             launch(scatter, grid, *arrays, n, first, WIDTH=self._width, BLOCK=size)
-            if marks is not None:
+            if marks is not None and len(marks):  # a table on a GPU has none
                 marks.fill_(1)
         dp = torch.empty_like(p) if points else None
         if dp is not None:
