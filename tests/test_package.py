@@ -85,7 +85,7 @@ def test_exactly_one_opencv():
 
 
 def test_imported_packages_are_the_declared_dependencies():
-    standard = sys.stdlib_module_names | {"sl_nerfstudio"}
+    standard = sys.stdlib_module_names | {"sl_nerfstudio", "triton"}  # which comes with torch, if at all
     imported = {name.split(".")[0] for path in modules() for name in imports(path)} - standard
     extras = [text for name, texts in PROJECT["optional-dependencies"].items()
               if name not in ("dev", "docs") for text in texts]  # fmt: skip
