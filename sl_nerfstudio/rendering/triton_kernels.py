@@ -366,7 +366,7 @@ def direct(
 ):  # fmt: skip
     """Add the terms of points to the sums."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
-    spread = tl.load(surface_width).to(tl.float32)
+    spread = tl.maximum(tl.load(surface_width).to(tl.float32), 1e-9)  # 0 where the term is not used
     w = tl.load(weight + i, i < n, 0.0)
     some = w > 0.0
     at_surface, in_front = tl.load(f + start + 2 * n + i, some, 0.0), tl.load(f + start + i, some, 0.0)
@@ -394,7 +394,7 @@ def direct_adjoint(
     """Adjoints of the field at all of these points, and of its gradient."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     there, own = i < n + others, i < n
-    spread = tl.load(surface_width).to(tl.float32)
+    spread = tl.maximum(tl.load(surface_width).to(tl.float32), 1e-9)  # 0 where the term is not used
     w = tl.load(weight + i, own, 0.0)
     some, share = w > 0.0, w / tl.maximum(tl.load(sums + 6), 1e-9)
     each = tl.load(g_free_space) * FREE_SPACE / tl.maximum(tl.load(sums + 8), 1.0)

@@ -90,7 +90,8 @@ def ours(name: str, step_of: "Settings", cache: Tensor) -> tuple[StepLosses, lis
     x, field = scene(name), Bumps(torch.float32)
     pixels = Pixels(x["index"], x["among"], x["frame"], x["row"], x["column"], x["coords"], x["captured"])
     devices = Devices(Intrinsics.of([CAMERA] * FRAMES), Intrinsics.of(PROJECTORS[name]), x["pattern"])
-    scalars = [torch.tensor(value, dtype=torch.float64) for value in (25.0, WIDTH)]
+    width = WIDTH if step_of.losses.direct else 0.0  # as in a training
+    scalars = [torch.tensor(value, dtype=torch.float64) for value in (25.0, width)]
     scalars += [torch.tensor(value) for value in (NOISE.px, NOISE.px_per_length)]
     step = Step(pixels, devices, Current(*scalars), cache, step_of.sampling, step_of.losses, step_of.renders)
     poses = moving(x, torch.float32)
