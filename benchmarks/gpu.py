@@ -1,16 +1,21 @@
-"""Everything that is to be known of a GPU, within ten minutes, into one file.
+"""Everything that is to be known of a GPU, within nine minutes, into one file.
 
-    python -m benchmarks.gpu [--device cpu --steps 2 --paper-steps 3 --default-steps 30] [--only NAME]
+    python -m benchmarks.gpu [--scan FOLDER] [--device cpu --steps 2 --paper-steps 3 --default-steps 30] [--only NAME]
 
-Step times and memory of both methods with every backend, with and without a CUDA graph; whole trainings, with their
-surfaces against the truth, and against the same training on the CPU; the same step with nerfstudio's own encoding, in
-torch and, if it can be imported, tiny-cuda-nn. A part that fails is written down with its error, and the next one
-begins; the file is written after each. With `--device cpu` all of it runs without a GPU, except for what needs one.
+In order of value: the kernels against double precision; times of a step and of the loop around it, waits and memory, of
+both methods with every backend, with and without a CUDA graph; recording beside a thread that uses the GPU; new
+recordings while levels are switched on; whole trainings, with their surfaces against the truth, and against the same
+training on the CPU; the same step with nerfstudio's own encoding. A part that fails is written down with its error, and
+the next one begins; what there is no time for is left out by name; the file is written after each part. With `--device
+cpu` all of it runs without a GPU, except for what needs one. Without open3d, `--scan` is needed (one with its truth),
+and distances are those of the true surface's points from the field's zero, by its values and slopes.
 """
 
+import copy
 import json
 import statistics
 import tempfile
+import threading
 import time
 import traceback
 import warnings
@@ -26,17 +31,13 @@ import torch
 
 from benchmarks.common.iteration_step import SIZES, Ours, Theirs, softplus
 from benchmarks.common.measuring import describe, parsed
-from benchmarks.common.runs import made_once
 from benchmarks.common.training import Training, model_of, settings
 from sl_nerfstudio.errors import first_line
-from sl_nerfstudio.evaluation.evaluate import read_reference, score_alignments
-from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.field.backend import BackendName
+from sl_nerfstudio.field.field import FieldConfig, SDFField
 from sl_nerfstudio.meshing.extract import extract_mesh
-from sl_nerfstudio.meshing.visibility import trim_to_observed
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan.write import read_ground_truth
-from sl_nerfstudio.synthesis.config import SynthConfig
 
 METHODS = {"paper": "sl-neus-paper", "default": "sl-neus"}
 _GROUPS = 10  # of timed steps; their median counts
@@ -47,13 +48,15 @@ class Config:
     """All measurements on one device."""
 
     device: str = "cuda"  # where the field is; cpu: to try this command
-    frames: int = 22  # of the scan, which is made in outputs/bench unless it is there
+    scan: Path | None = None  # by default one is made in outputs/bench
+    frames: int = 22  # of the scan that is made
     resolution: int = 400
     steps: int = 200  # timed ones of each variant, after the first ones that are not timed
     paper_steps: int = 10_000  # length of the whole training of sl-neus-paper on the device
     default_steps: int = 1000  # of sl-neus, on the device and on the CPU
     compared_steps: int = 300  # of the trainings of sl-neus-paper that compare the device with the CPU
     mesh_resolution: int = 256  # cells along the scene's box of the surfaces that are compared
+    seconds: int = 520  # no part begins after these
     only: tuple[str, ...] = ()  # parts of the names of what is measured; by default all
     output: Path = Path("benchmarks/results/gpu.json")
 
@@ -61,13 +64,14 @@ class Config:
 def main(config: Config) -> dict[str, Any]:
     """Measure part after part; print and write each."""
     warnings.simplefilter("ignore")
-    scan = made_once(SynthConfig(frames=config.frames, resolution=config.resolution), Path("outputs/bench")).scan.root
+    scan = config.scan or _made(config)
     result: dict[str, Any] = {"machine": describe_device(config.device)}
     begin = time.monotonic()
     with one_library_thread():
         for name, part in parts(config, scan).items():
             try:
-                result[name] = part()
+                late = time.monotonic() - begin > config.seconds
+                result[name] = {"left out": f"{config.seconds} s are over"} if late else part()
             except Exception as error:  # whatever a driver or a library does, the other figures are still wanted
                 result[name] = {"error": first_line(error), "where": traceback.format_exc(limit=-3)}
             print(f"{name}: {json.dumps(result[name])}", flush=True)
@@ -79,27 +83,30 @@ def main(config: Config) -> dict[str, Any]:
 
 def parts(config: Config, scan: Path) -> dict[str, Callable[[], dict[str, Any]]]:
     """All measurements by name."""
-    there, found = config.device, {}
+    there = config.device
+    found: dict[str, Callable[[], dict[str, Any]]] = {"kernels": partial(against_double_precision, config)}
     for size in METHODS:
-        for backend in backends(there):
+        for backend in reversed(backends(there)):
             for graph in (False, True) if there == "cuda" else (False,):
                 name = f"step {size} {backend}{' graph' if graph else ''}"
                 found[name] = partial(step_times, config, scan, size, backend, graph)
-    for size in SIZES:
-        for name, make in encodings(there).items():
-            found[f"encoding {size} {name}"] = partial(encoding_times, config, partial(make, SIZES[size]))
+    if there == "cuda":
+        found["beside a busy thread"] = partial(beside_a_busy_thread, config, scan)
+        found["new recordings"] = partial(new_recordings, config, scan)
     for device in dict.fromkeys((there, "cpu")):
         found[f"surface paper {device}"] = partial(surface, config, scan, "paper", device, config.compared_steps)
         found[f"surface default {device}"] = partial(surface, config, scan, "default", device, config.default_steps)
-    found[f"surface paper {config.paper_steps} steps"] = partial(
-        surface, config, scan, "paper", there, config.paper_steps
-    )
+    long = partial(surface, config, scan, "paper", there, config.paper_steps)
+    found[f"surface paper {config.paper_steps} steps"] = long
+    for size in SIZES:
+        for name, make in encodings(there).items():
+            found[f"encoding {size} {name}"] = partial(encoding_times, config, partial(make, SIZES[size]))
     return {name: part for name, part in found.items() if not config.only or any(x in name for x in config.only)}
 
 
 def backends(device: str) -> list[BackendName]:
     """What can compute the field there."""
-    return ["torch", "warp"] if device == "cuda" else ["torch", "numba"]
+    return ["torch", "triton"] if device == "cuda" else ["torch", "numba"]
 
 
 def encodings(device: str) -> dict[str, Callable[..., Ours | Theirs]]:
@@ -127,8 +134,96 @@ def step_times(config: Config, scan: Path, size: str, backend: BackendName, grap
     _forget_memory(config.device)
     training = begun(scan, size, config.device, 1000, backend, graph, adjust=False)
     training.done = 601  # all levels have their weight
-    times = _timed(training.step, config.steps, config.device)
-    return {**times, "graph": training.trainer.recorded is not None, **_memory(config.device)}
+    begin = time.perf_counter()
+    training.trainer._compile_kernels()
+    found: dict[str, Any] = {"compile_s": round(time.perf_counter() - begin, 2)}
+    found |= _timed(training.step, config.steps, config.device)
+
+    def turn() -> None:
+        training.step()
+        training.after()
+
+    found["loop_ms"] = _timed(turn, config.steps, config.device)["ms"]
+    if config.device == "cuda":
+        found["waits"] = waits(turn)
+    return {**found, "graph": training.trainer.recorded is not None, **_memory(config.device)}
+
+
+def waits(turn: Callable[[], Any]) -> dict[str, int]:
+    """Where the host waited for the GPU in ten turns of the loop, as torch notices it."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        torch.cuda.set_sync_debug_mode("warn")
+        try:
+            for _ in range(10):
+                turn()
+        finally:
+            torch.cuda.set_sync_debug_mode("default")
+    places = [f"{Path(x.filename).name}:{x.lineno}" for x in caught if "synchroniz" in str(x.message)]
+    return {place: places.count(place) for place in dict.fromkeys(places)}
+
+
+def against_double_precision(config: Config) -> dict[str, Any]:
+    """Greatest differences of values, slopes and all gradients from torch's in float64, over the greatest of these."""
+    torch.manual_seed(0)
+    exact = SDFField(FieldConfig(backend="torch")).double()
+    with torch.no_grad():
+        exact.encoding.table.normal_(0, 0.05)
+    p = torch.rand(30_000, 3, dtype=torch.float64) * 2.2 - 1.1
+    wanted = _derivatives(copy.deepcopy(exact), p)
+    found = {}
+    for backend in backends(config.device):
+        field = copy.deepcopy(exact).float().to(config.device)
+        field.config = FieldConfig(backend=backend)
+        got = _derivatives(field, p.to(config.device, torch.float32))
+        errors = [float((a - b).abs().max() / b.abs().max()) for a, b in zip(got, wanted, strict=True)]
+        found[backend] = [float(f"{error:.1e}") for error in errors]
+    return found
+
+
+def _derivatives(field: SDFField, p: torch.Tensor) -> list[torch.Tensor]:
+    p = p.clone().requires_grad_()
+    f, slopes = field.sdf_and_last_gradients(p, len(p) * 2 // 3)
+    (f.square().sum() + (slopes.norm(dim=-1) - 1).square().sum()).backward()
+    return [x.detach().double().cpu() for x in (f, slopes, p.grad, *(y.grad for y in field.parameters()))]
+
+
+def beside_a_busy_thread(config: Config, scan: Path) -> dict[str, Any]:
+    """Whether a step is recorded while another thread, as the viewer's, allocates, computes and waits."""
+    training = begun(scan, "default", config.device, 1000, "auto", True, adjust=False)
+    training.done, stop, errors = 601, threading.Event(), []
+
+    def busy() -> None:
+        while not stop.is_set() and not errors:
+            try:
+                torch.rand(1 << 22, device="cuda").cpu()
+                torch.cuda.empty_cache()
+            except RuntimeError as error:
+                errors.append(first_line(error))
+
+    thread = threading.Thread(target=busy)
+    thread.start()
+    try:
+        for _ in range(10):
+            training.step()
+    finally:
+        stop.set()
+        thread.join()
+    return {"graph": training.trainer.recorded is not None, "errors_of_the_thread": errors}
+
+
+def new_recordings(config: Config, scan: Path) -> dict[str, Any]:
+    """Steps of a short training that took far longer than the others, and the memory at its end."""
+    training = begun(scan, "default", config.device, 120, "auto", True, adjust=False)
+    slow = []
+    for step in range(140):
+        begin = time.perf_counter()
+        training.step()
+        training.after()
+        _wait(config.device)
+        if time.perf_counter() - begin > 0.02:
+            slow.append((step, round(time.perf_counter() - begin, 3)))
+    return {"slow_steps": slow, "graph": training.trainer.recorded is not None, **_memory(config.device)}
 
 
 def encoding_times(config: Config, make: Callable[[], Ours | Theirs]) -> dict[str, Any]:
@@ -154,8 +249,17 @@ def surface(config: Config, scan: Path, size: str, device: str, steps: int) -> d
 
 
 def rmse(resolution: int, training: Training) -> dict[str, Any]:
-    """RMS and median distance of the observed surface from the truth, in mm, after rigid alignment."""
+    """RMS and median distance of the observed surface from the truth, in mm, after rigid alignment.
+
+    Without open3d: of the true surface's points, but for the farthest fifth, which may not have been observed.
+    """
     model = training.model.eval()
+    if find_spec("open3d") is None:
+        return _by_values(model)
+    from sl_nerfstudio.evaluation.evaluate import read_reference, score_alignments
+    from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+    from sl_nerfstudio.meshing.visibility import trim_to_observed
+
     whole = extract_mesh(model.sdf, resolution, device=model.device).mapped(model.S_scene_world.inverse())
     observed = trim_to_observed(whole, model.scan, model.poses()).mesh
     truth = read_ground_truth(model.scan)
@@ -166,10 +270,34 @@ def rmse(resolution: int, training: Training) -> dict[str, Any]:
     return {"rmse_mm": round(accuracy.rmse, 4), "median_mm": round(accuracy.median, 4)}
 
 
+def _by_values(model: Any) -> dict[str, Any]:
+    import trimesh
+
+    mesh = trimesh.load(read_ground_truth(model.scan).mesh_path, force="mesh")
+    points = torch.from_numpy(
+        model.S_scene_world.points(trimesh.sample.sample_surface(mesh, 50_000, seed=0)[0])
+    ).float()
+    with torch.no_grad():
+        f, slopes = model.field.sdf_and_gradient(points.to(model.device))
+    distance = (f.abs() / slopes.norm(dim=-1).clamp_min(0.1)).sort().values[: len(f) * 4 // 5].cpu()
+    distance = distance / model.S_scene_world.scale
+    return {
+        "rmse_mm": round(float(distance.square().mean().sqrt()), 4),
+        "median_mm": round(float(distance.median()), 4),
+    }
+
+
+def _made(config: Config) -> Path:
+    from benchmarks.common.runs import made_once
+    from sl_nerfstudio.synthesis.config import SynthConfig
+
+    return made_once(SynthConfig(frames=config.frames, resolution=config.resolution), Path("outputs/bench")).scan.root
+
+
 def describe_device(device: str) -> dict[str, Any]:
     """The machine, the GPU, its driver, and the versions that matter."""
     found: dict[str, Any] = dict(describe())
-    found["warp"] = version("warp-lang") if find_spec("warp") is not None else None
+    found["triton"] = version("triton") if find_spec("triton") is not None else None
     if device == "cuda":
         properties = torch.cuda.get_device_properties(0)
         found |= {"gpu": properties.name, "gpu_mb": properties.total_memory >> 20, "cuda": torch.version.cuda}

@@ -1,11 +1,12 @@
-"""What a training step asks of a GPU: operations that become launches, and waits of the host; no GPU is needed.
+"""What the training's loop asks of a GPU: operations that become launches, and waits of the host; no GPU is needed.
 
-    python -m benchmarks.launches [--scan FOLDER] [--backends torch warp] [--output FILE]
+    python -m benchmarks.launches [--scan FOLDER] [--backends torch triton] [--output FILE]
 
 Steps of the methods run on a pretended GPU (benchmarks/pretended): tensors say that they are on it and hold their
-values on the CPU, and every operation is counted where torch hands it to a device. Kernels in Warp are counted, too. A
-large operation of torch, such as a sort, may launch several kernels. Recorded as a CUDA graph, a step is one launch,
-besides those that set its scalars.
+values on the CPU, and every operation is counted where torch hands it to a device. Kernels in Triton are counted, too,
+but do not run, so figures of a training mean nothing here. A large operation of torch, such as a sort, may launch
+several kernels. Recorded as a CUDA graph, a step is one launch, besides those that set its scalars. What the loop does
+after a step is counted with it.
 """
 
 import tempfile
@@ -24,7 +25,7 @@ from benchmarks.pretended.recorder import PretendedRecorder
 from sl_nerfstudio.model.loop import WARM_UP
 from sl_nerfstudio.synthesis.config import SynthConfig
 
-Backend = Literal["torch", "warp"]
+Backend = Literal["torch", "triton"]
 METHODS = {"paper": "sl-neus-paper", "default": "sl-neus"}
 _COUNTED = 5  # steps; none of them refreshes the cached grid
 
@@ -35,7 +36,7 @@ class Config:
 
     scan: Path | None = None  # to train on; by default a small one is made in outputs/bench
     sizes: tuple[str, ...] = ("paper", "default")  # `sl-neus-paper` and `sl-neus`, with their own settings
-    backends: tuple[Backend, ...] = ("torch", "warp")  # that compute the field
+    backends: tuple[Backend, ...] = ("torch", "triton")  # that compute the field
     rays: int | None = None  # pixels of a step; by default the method's own number. The counts do not depend on it
     output: Path | None = None
 
@@ -48,7 +49,7 @@ class Row:
     backend: str
     launches: int  # of most steps
     most: int  # of a step that also writes to the history, every fifth one at first
-    of_warp: int  # of these, kernels in Warp
+    of_triton: int  # of these, kernels in Triton
     waits: int  # of the host, most of any step
     between: int  # launches before a step that set its scalars, most of any step
     refresh: int  # launches that refresh the cached grid, every 20 steps; 0 where there is none
@@ -58,7 +59,7 @@ class Row:
 
 def count(size: str, backend: Backend, config: Config) -> Row:
     """Take some steps, all terms and all levels in use, and count."""
-    with PretendedGpu(kernels=backend == "warp") as gpu, tempfile.TemporaryDirectory() as folder:
+    with PretendedGpu(kernels=backend == "triton", dry=True) as gpu, tempfile.TemporaryDirectory() as folder:
         run = settings(METHODS[size], _scan(config), Path(folder), "cuda", 1000)
         run.cuda_graph = False
         model_of(run).sdf.backend = backend
@@ -78,7 +79,7 @@ def count(size: str, backend: Backend, config: Config) -> Row:
     usual, *_, most = sorted(plain, key=lambda seen: seen.launches.total())
     return Row(
         size, backend, usual.launches.total(), most.launches.total(),
-        sum(n for name, n in usual.launches.items() if name.startswith("warp ")),
+        sum(n for name, n in usual.launches.items() if name.startswith("triton ")),
         max(seen.waits.total() for seen in plain), max(seen.launches.total() for seen in between),
         refresh.launches.total(), min(seen.launches.total() for seen in repeated), dict(usual.launches.most_common()),
     )  # fmt: skip
@@ -91,6 +92,7 @@ def _steps(training: Training, gpu: PretendedGpu) -> tuple[list, list]:
             training.before()
         with gpu.counting() as step:
             training.iterate()
+            training.after()
         steps.append(step)
         between.append(before)
     return steps, between

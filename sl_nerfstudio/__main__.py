@@ -23,7 +23,6 @@ _EXTRAS = {
     "phone": "photographs of phones (.heic)",
     "video": "captures from a video",
     "las": "point clouds for surveying programs (sl-export --points cloud.las)",
-    "cuda": "the field's own kernels on NVIDIA GPUs",
 }
 _GROUPS = {"nerfstudio.method_configs": "methods", "nerfstudio.dataparser_configs": "dataparsers"}
 _AGREE = 1e-4  # scene units; the backends differ by rounding, some 1e-7
@@ -127,7 +126,7 @@ def backends() -> str:
     small = FieldConfig(levels=2, max_resolution=32, log2_table_size=10, hidden=32, backend="torch")
     torch.manual_seed(0)
     field = SDFField(small)
-    points = torch.rand(1000, 3) * 2 - 1
+    points, obstacle = torch.rand(1000, 3) * 2 - 1, None
     with torch.no_grad():
         values = {"torch on cpu": field.sdf(points)}
         small.backend = "numba"
@@ -135,14 +134,16 @@ def backends() -> str:
         small.backend = "torch"
         if torch.cuda.is_available():
             values["torch on cuda"] = field.to("cuda").sdf(points.to("cuda")).cpu()
-            if field.obstacle("warp") is None:
-                small.backend = "warp"
-                values["warp on cuda"] = field.sdf(points.to("cuda")).cpu()
+            obstacle = field.obstacle("triton")
+            if obstacle is None:
+                small.backend = "triton"
+                values["triton on cuda"] = field.sdf(points.to("cuda")).cpu()
     worst = {name: float((value - values["torch on cpu"]).abs().max()) for name, value in values.items()}
     wrong = [name for name, difference in worst.items() if not difference < _AGREE]
     if wrong:
         raise Missing(f"{', '.join(wrong)}: other values than torch on the CPU ({max(worst.values()):.2g})")
-    return f"{', '.join(values)} agree to {max(worst.values()):.1g}"
+    without = "" if obstacle is None else f"; the GPU's kernels are not used: {obstacle}"
+    return f"{', '.join(values)} agree to {max(worst.values()):.1g}{without}"
 
 
 def extras() -> str:

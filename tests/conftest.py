@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ["TRITON_INTERPRET"] = "1"  # kernels for GPUs run on the CPU
 os.environ["SL_CACHE"] = os.devnull  # for fixtures of several tests: nothing is found there, or written
 
 if os.environ.get("SL_TYPE_CHECKS"):  # every call's shapes, dtypes and types: about a third slower
@@ -16,8 +17,8 @@ if os.environ.get("SL_TYPE_CHECKS"):  # every call's shapes, dtypes and types: a
 
     _ROOT = Path(__file__).parents[1]
     _MODULES = [".".join(f.relative_to(_ROOT).with_suffix("").parts) for f in _ROOT.glob("sl_nerfstudio/**/*.py")]
-    # Warp compiles what is in its modules; its types are not those of Python.
-    _CHECKED = [m for m in _MODULES if "warp" not in m and not m.endswith("__init__")]
+    # Triton compiles what is in its modules; its types are not those of Python.
+    _CHECKED = [m for m in _MODULES if "triton" not in m and not m.endswith("__init__")]
     jaxtyping.install_import_hook(_CHECKED, "beartype.beartype")
 
 import hypothesis

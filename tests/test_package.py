@@ -25,7 +25,7 @@ SCRIPTS: dict[str, str] = PROJECT["scripts"]
 # Dependencies whose import name differs from the name of the distribution.
 IMPORTED_AS = {
     "opencv-python-headless": "cv2", "pillow": "PIL", "pygame-ce": "pygame", "pyyaml": "yaml",
-    "pillow-heif": "pillow_heif", "scikit-image": "skimage", "warp-lang": "warp",
+    "pillow-heif": "pillow_heif", "scikit-image": "skimage",
 }  # fmt: skip
 # Declared without being imported here, each with the reason.
 NOT_IMPORTED: dict[str, str] = {}
@@ -69,7 +69,7 @@ def test_exactly_one_opencv():
 
 
 def test_imported_packages_are_the_declared_dependencies():
-    standard = sys.stdlib_module_names | {"sl_nerfstudio"}
+    standard = sys.stdlib_module_names | {"sl_nerfstudio", "triton"}  # which comes with torch, if at all
     imported = {name.split(".")[0] for names in IMPORTS.values() for name in names} - standard
     extras = [text for name, texts in PROJECT["optional-dependencies"].items()
               if name not in ("dev", "docs") for text in texts]  # fmt: skip

@@ -1,6 +1,7 @@
 """A training of one of our methods, taken step by step: nerfstudio's trainer and callbacks, without its loop."""
 
 import copy
+import time
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -53,6 +54,7 @@ class Training:
         if adjust:
             self.model.adjust_poses(samples)
         self.model.measure_noise(samples)
+        self.trainer._saved = (None, time.monotonic())
         self.done = 0
 
     @property
@@ -82,3 +84,7 @@ class Training:
         """The step itself."""
         self.done += 1
         return self.trainer.train_iteration(self.done - 1)
+
+    def after(self) -> None:
+        """What the loop does after a step: evaluation and a checkpoint if they are due, and the line of progress."""
+        self.trainer.eval_iteration(self.done - 1)

@@ -12,7 +12,7 @@ from unittest import mock
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
-from torch.utils._python_dispatch import TorchDispatchMode, return_and_correct_aliasing
+from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_modes, return_and_correct_aliasing
 from torch.utils._pytree import tree_leaves, tree_map
 
 from sl_nerfstudio.field import device_kernels
@@ -153,13 +153,17 @@ class Seen:
 class PretendedGpu(TorchDispatchMode):
     """Use as a context. `seen` counts from the start or from the last `counting()`."""
 
-    def __init__(self, kernels: bool = False) -> None:
-        """`kernels`: those in Warp run, too; otherwise they find no driver."""
+    def __init__(self, kernels: bool = False, dry: bool = False) -> None:
+        """`kernels`: those in Triton run, too, interpreted; otherwise none can be compiled.
+
+        If `dry`, they are only counted: what they should have written is left as it was.
+        """
         super().__init__()
         self.seen = Seen()
         self.on_kernel: list[Callable[[Callable[[], None]], None]] = []
-        """Told of every kernel in Warp, as what runs it again."""
+        """Told of every kernel in Triton, as what runs it again."""
         self._kernels = kernels
+        self._dry = dry
         self._functions = _Functions(self)
         self.works_there = False  # in an operation on the GPU, whose parts torch makes where it believes to be
         self.calls_factory = False  # for our own code, which says where
@@ -174,8 +178,8 @@ class PretendedGpu(TorchDispatchMode):
             (torch._C, "_group_tensors_by_device_and_dtype", _grouped(torch._C._group_tensors_by_device_and_dtype)),
             (torch.autograd, "_engine_run_backward", self._backward(torch.autograd._engine_run_backward)),
         ]  # fmt: skip
-        if self._kernels:
-            replaced += [(device_kernels, "run", self._run_kernel), (device_kernels, "obstacle", lambda _: None)]
+        replaced.append((device_kernels, "run", self._run_kernel))
+        replaced.append((device_kernels, "_tried", lambda _: None if self._kernels else "a pretended GPU runs nothing"))
         for owner, name, stand_in in replaced:
             self._stack.enter_context(mock.patch.object(owner, name, stand_in))
         self._stack.enter_context(torch.autograd.set_multithreading_enabled(False))
@@ -216,16 +220,20 @@ class PretendedGpu(TorchDispatchMode):
         finally:
             self.works_there = before
 
-    def _run_kernel(self, kernel: Any, dim: Any, arguments: tuple[Any, ...]) -> None:
+    def _run_kernel(
+        self, kernel: Any, grid: tuple[int, ...], arguments: tuple[Any, ...], constants: dict[str, Any]
+    ) -> None:
         tensors = [x for x in arguments if isinstance(x, Tensor)]
         there = [isinstance(x, DeviceTensor) for x in tensors]
         if any(there) and not all(there):
-            raise MixedDevicesError(f"{kernel.key}: {[f'{x.device} {tuple(x.shape)}' for x in tensors]}")
-        work = partial(_KERNEL_RUN, kernel, dim, tuple(on_cpu(x) for x in arguments))
-        work()
+            at = [f"{x.device} {tuple(x.shape)}" for x in tensors]
+            raise MixedDevicesError(f"{device_kernels.name_of(kernel)}: {at}")
+        work = partial(_interpret, kernel, grid, tuple(on_cpu(x) for x in arguments), constants)
+        if not self._dry:
+            work()
         if any(there):
-            self.seen.launches[f"warp {kernel.key}"] += 1
-            for told in self.on_kernel:
+            self.seen.launches[f"triton {device_kernels.name_of(kernel)}"] += 1
+            for told in [] if self._dry else self.on_kernel:
                 told(work)
 
     def wait(self, why: str) -> None:
@@ -256,7 +264,8 @@ class PretendedGpu(TorchDispatchMode):
         if not others:
             return
         if name_of(func) == "copy_":
-            self.wait("a copy between host and device")
+            if not (len(args) > 2 and args[2] and all(getattr(x, "pinned", False) for x in others)):
+                self.wait("a copy between host and device")
             return
         if indexes(func) and isinstance(args[0], DeviceTensor):
             mine = {id(x) for x in args[1] if x is not None}
@@ -265,6 +274,12 @@ class PretendedGpu(TorchDispatchMode):
             others = [x for x in others if id(x) not in mine]
         if others and not (takes_scalars_of_the_cpu(func) and all(x.dim() == 0 for x in others)):
             raise MixedDevicesError(f"{func}: {[f'{x.device} {tuple(x.shape)}' for x in tensors]}")
+
+
+def _interpret(*launch: Any) -> None:
+    """Run a kernel; what the interpreter does with torch is none of the GPU's business."""
+    with _disable_current_modes(), torch._C.DisableTorchFunction():
+        _KERNEL_RUN(*launch)
 
 
 class _Functions(TorchFunctionMode):
@@ -299,7 +314,9 @@ class _Functions(TorchFunctionMode):
         if name in ("tensor", "as_tensor"):
             made = func(*(on_cpu(x) if name == "as_tensor" else x for x in args), **kwargs)
             return self._upload(made) if wanted_there else made
+        pinned = kwargs.pop("pin_memory", False)
         made = func(*args, **kwargs)
+        made.pinned = pinned
         if not wanted_there:
             return self._read(made) if isinstance(made, DeviceTensor) else made
         if not isinstance(made, DeviceTensor):

@@ -7,7 +7,6 @@ An implementation evaluates the field inside and outside its box and pulls gradi
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import partial
-from importlib.util import find_spec
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -17,6 +16,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.autograd.graph import get_gradient_edge
 
+from sl_nerfstudio.field.device_kernels import obstacle
 from sl_nerfstudio.field.numba_grid import LIST, clear
 from sl_nerfstudio.parallel import parallel, split
 
@@ -120,7 +120,7 @@ class TableGradient:
         parallel([partial(work, start, stop) for start, stop in split(len(self.buffer), 8, 64)])
 
 
-BackendName = Literal["auto", "torch", "numba", "warp"]
+BackendName = Literal["auto", "torch", "numba", "triton"]
 
 
 @dataclass(frozen=True)
@@ -229,16 +229,12 @@ def numba_cannot(table: Tensor) -> str | None:
     return None
 
 
-def warp_cannot(table: Tensor) -> str | None:
-    """Why the kernels for GPUs cannot serve a field, or None if they can; only imports Warp if all else fits."""
+def triton_cannot(table: Tensor) -> str | None:
+    """Why the kernels for GPUs cannot serve a field, or None if they can."""
     if table.dtype != torch.float32:
-        return f"the warp backend computes in float32, the field is {table.dtype}"
+        return f"the triton backend computes in float32, the field is {table.dtype}"
     if table.device.type not in ("cpu", "cuda"):
-        return f"the warp backend runs on CUDA and on the CPU, the field is on {table.device}"
-    if find_spec("warp") is None:
-        return "the warp backend needs the package warp-lang: pip install 'sl-nerfstudio[cuda]'"
-    from sl_nerfstudio.field.device_kernels import obstacle
-
+        return f"the triton backend runs on CUDA, the field is on {table.device}"
     return obstacle(table.device)
 
 

@@ -1,75 +1,103 @@
-"""Kernels for GPUs, written in Warp: compiled at first use, launched on their tensors' device and stream, and counted.
+"""Kernels for GPUs, written in Triton: whether they can run, and how they are launched and counted.
 
-The same kernels run on the CPU, where tests compare them with torch. Warp's import takes half a second, so only files
-that hold kernels import this one, and they are imported only when a tensor is on a GPU, or on request.
+Triton comes with torch on Linux; nothing of it is imported before a tensor is on a GPU. With TRITON_INTERPRET=1 in the
+environment the same kernels run on the CPU, slowly: tests compare them with torch in double precision.
 """
 
-import inspect
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cache
+from importlib.util import find_spec
 from typing import Any
 
 import torch
-import warp as wp
 from torch import Tensor
 
-wp.config.log_level = wp.LOG_WARNING  # else it prints its version, its devices and what it compiles
+from sl_nerfstudio.errors import last_line
 
-Argument = Tensor | float | int | Any  # the last one: vectors of Warp
-_BLOCK = 64  # threads: some kernels have a thread per ray, and a few hundred rays should keep many multiprocessors busy
+INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
+_INTERPRETED_AT_ONCE = 4096  # elements of a block: an interpreted program takes as long, however small it is
 _watchers: list[Callable[[str], None]] = []
+_failures: list[str] = []
 
 
-def kernel(function: Callable[..., None]) -> Any:
-    """A kernel without an adjoint of its own, free of the run-time type checks that tests wrap functions in."""
-    return wp.kernel(inspect.unwrap(function), enable_backward=False)
+def launch(kernel: Any, programs: int | tuple[int, int], *arguments: Tensor | float | int, **constants: Any) -> None:
+    """Queue a kernel on its tensors' GPU, on torch's current stream.
 
-
-def part(function: Callable[..., Any]) -> Any:
-    """A function that kernels call."""
-    return wp.func(inspect.unwrap(function))
-
-
-def structure(name: str, module: str, **fields: Any) -> Any:
-    """A structure of kernels; as a class it would be wrapped, too."""
-    return wp.struct(type(name, (), {"__annotations__": fields, "__module__": module}))
-
-
-def launch(kernel: wp.Kernel, dim: int | tuple[int, ...], *arguments: Argument) -> None:
-    """Run a kernel on its tensors; on a GPU it is only queued, on torch's current stream.
-
-    Nothing is allocated and nothing waits, so that a CUDA graph can capture it once the kernel has run before.
+    Nothing is allocated and nothing waits, so that a CUDA graph can capture it once it was compiled. Without programs
+    nothing is done. The constants are part of the compiled kernel, as is `num_warps`. Tensors must have no gaps, unless
+    the kernel has STRIDES.
     """
+    grid = (programs,) if isinstance(programs, int) else programs
+    if 0 in grid:
+        return
+    dense = "STRIDES" in constants or all(x.is_contiguous() for x in arguments if isinstance(x, Tensor))
+    assert dense, f"{name_of(kernel)}: a tensor with gaps"
     for watcher in _watchers:
-        watcher(kernel.key)
-    run(kernel, dim, arguments)
+        watcher(name_of(kernel))
+    run(kernel, grid, arguments, constants)
 
 
-def run(kernel: wp.Kernel, dim: int | tuple[int, ...], arguments: tuple[Argument, ...]) -> None:
+def run(kernel: Any, grid: tuple[int, ...], arguments: tuple[Any, ...], constants: dict[str, Any]) -> None:
     """`launch` without telling those who count; what pretends to be a GPU replaces this function."""
     tensors = [x for x in arguments if isinstance(x, Tensor)]
     device = tensors[0].device
-    assert all(x.device == device for x in tensors), f"{kernel.key}: tensors on several devices"
-    values = [
-        _array(x, argument.type) if isinstance(x, Tensor) else x
-        for x, argument in zip(arguments, kernel.adj.args, strict=True)
-    ]
+    assert all(x.device == device for x in tensors), f"{name_of(kernel)}: tensors on several devices"
+    arguments = tuple(x.detach() if isinstance(x, Tensor) else x for x in arguments)
     if device.type == "cuda":
-        stream = _stream(device.index, torch.cuda.current_stream(device).cuda_stream)
-        wp.launch(kernel, dim, values, stream=stream, block_dim=_BLOCK, record_tape=False)
+        with torch.cuda.device(device):
+            kernel[grid](*arguments, **constants)
     else:
-        wp.launch(kernel, dim, values, device="cpu", record_tape=False)
+        kernel[grid](*arguments, **constants)
+
+
+def name_of(kernel: Any) -> str:
+    """The name of a kernel, compiled or interpreted."""
+    return kernel.fn.__name__
+
+
+def block(usual: int, n: int) -> int:
+    """How many of n elements one program takes: the usual number, more if programs are interpreted."""
+    if not INTERPRETED:
+        return usual
+    return max(usual, min(1 << max(n - 1, 0).bit_length(), _INTERPRETED_AT_ONCE))
 
 
 def obstacle(device: torch.device) -> str | None:
-    """Why kernels cannot run on a device, or None if they can."""
-    if device.type == "cpu" or wp.is_cuda_available():
-        return None
-    return (
-        f"warp-lang {wp.__version__} finds no driver for {device} that it can use: its ordinary wheel needs an NVIDIA "
-        "driver for CUDA 13 (R580 or newer), its wheels with +cu12 in their version serve older ones"
-    )
+    """Why kernels cannot run on a device, or None if they can. The first call for a GPU compiles a tiny one."""
+    if device.type == "cpu" and not INTERPRETED:
+        return "the triton backend runs on a GPU; on the CPU only with TRITON_INTERPRET=1 in the environment"
+    return _failures[0] if _failures else _tried(device)
+
+
+def give_up(error: BaseException) -> str:
+    """From now on plain torch is used, because a kernel failed; returns why, in words."""
+    _failures[:] = [_why(error)]
+    return _failures[0]
+
+
+@cache
+def _tried(device: torch.device) -> str | None:
+    if find_spec("triton") is None:
+        return "the triton backend needs the package triton, which comes with torch on Linux"
+    try:
+        from sl_nerfstudio.field.triton_vectors import probe
+
+        x = torch.ones(1, device=device)
+        run(probe, (1,), (x,), {})
+        if float(x) != 2.0:
+            return "Triton compiles a kernel that computes something else"
+    except Exception as error:  # whatever a driver, a C compiler or a broken installation does
+        return _why(error)
+    return None
+
+
+def _why(error: BaseException) -> str:
+    said = f"Triton cannot compile or run kernels here ({type(error).__name__}: {last_line(error)})"
+    if isinstance(error, OSError):
+        return f"{said}; TRITON_CACHE_DIR may name a folder that can be written"
+    return f"{said}; it needs a driver for torch's CUDA, and a C compiler"
 
 
 @contextmanager
@@ -81,12 +109,3 @@ def launches() -> Iterator[list[str]]:
         yield names
     finally:
         _watchers.remove(names.append)
-
-
-def _array(x: Tensor, kind: Any) -> Any:
-    return wp.from_torch(x.detach(), dtype=kind.dtype, return_ctype=True)
-
-
-@lru_cache(maxsize=16)
-def _stream(device: int, handle: int) -> wp.Stream:
-    return wp.Stream(wp.get_device(f"cuda:{device}"), cuda_stream=handle)

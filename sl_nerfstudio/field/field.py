@@ -23,10 +23,10 @@ from sl_nerfstudio.field.backend import (
     MergedBackend,
     TableGradient,
     numba_cannot,
+    triton_cannot,
     value,
     value_and_gradient,
     value_and_last_gradients,
-    warp_cannot,
 )
 from sl_nerfstudio.field.hash_grid import GridLayout, HashGrid, SignedDistance
 from sl_nerfstudio.field.torch_backend import TorchField, knee
@@ -102,8 +102,8 @@ class FieldConfig:
     max_resolution: int = 256
     """Cells per axis of the grid's finest level; levels grow geometrically, by 2 with the default."""
     backend: BackendName = "auto"
-    """numba: compiled for this CPU; warp: kernels for GPUs, which need the extra [cuda]; torch: any device and
-    precision; auto: numba on the CPU and warp on GPUs, wherever they work."""
+    """numba: compiled for this CPU; triton: kernels for GPUs; torch: any device and precision; auto: numba on the CPU
+    and triton on GPUs, wherever they work."""
     levels: tyro.conf.Suppress[int] = 5
     """Levels of the feature grid."""
     log2_table_size: tyro.conf.Suppress[int] = 19
@@ -198,17 +198,17 @@ class SDFField(nn.Module):
         state = self._state()
         return value_and_last_gradients(self._backend(), self._buffer(), state, p, first)
 
-    def obstacle(self, backend: Literal["numba", "warp"]) -> str | None:
+    def obstacle(self, backend: Literal["numba", "triton"]) -> str | None:
         """Why a compiled backend cannot serve the field where it is, or None if it can."""
-        cannot = numba_cannot if backend == "numba" else warp_cannot
+        cannot = numba_cannot if backend == "numba" else triton_cannot
         return cannot(self.encoding.table)
 
     @property
-    def backend(self) -> Literal["torch", "numba", "warp"]:
+    def backend(self) -> Literal["torch", "numba", "triton"]:
         """What serves the field where it is. Raises UserError if the one chosen by hand cannot."""
         name, device = self.config.backend, self.encoding.table.device.type
         if name == "auto":
-            name = "numba" if device == "cpu" else "warp" if device == "cuda" else "torch"
+            name = "numba" if device == "cpu" else "triton" if device == "cuda" else "torch"
         if name == "torch":
             return "torch"
         obstacle = self.obstacle(name)
@@ -233,11 +233,11 @@ class SDFField(nn.Module):
 
 
 def _compiled(name: str, layout: GridLayout) -> FieldBackend | MergedBackend:
-    """A compiled backend; numba and Warp, which take a second to import, are imported only when needed."""
+    """A compiled backend; numba and Triton, which take a second to import, are imported only when needed."""
     if name == "numba":
         from sl_nerfstudio.field.numba_backend import NumbaField
 
         return NumbaField(layout, KNEE)
-    from sl_nerfstudio.field.warp_backend import WarpField
+    from sl_nerfstudio.field.triton_backend import TritonField
 
-    return WarpField(layout, KNEE)
+    return TritonField(layout, KNEE)

@@ -9,7 +9,6 @@ not have to. The learning rate may be a tensor, which a CUDA graph of the step r
 import math
 from collections.abc import Callable
 from functools import lru_cache, partial
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,7 @@ from torch.autograd.graph import increment_version
 from torch.optim import Optimizer
 
 from sl_nerfstudio.field.backend import TableGradient
+from sl_nerfstudio.field.device_kernels import obstacle
 from sl_nerfstudio.field.numba_grid import LIST, adam
 from sl_nerfstudio.parallel import parallel, split
 
@@ -135,26 +135,19 @@ def _step_marked(
 def _device_kernel_can(parameter: Tensor) -> bool:
     """Whether a table is on a GPU for which there is a kernel."""
     row = (parameter.dtype, *parameter.shape[1:])
-    if parameter.device.type != "cuda" or row != (torch.float32, 8) or find_spec("warp") is None:
-        return False
-    from sl_nerfstudio.field.device_kernels import obstacle
-
-    return obstacle(parameter.device) is None
+    return parameter.device.type == "cuda" and row == (torch.float32, 8) and obstacle(parameter.device) is None
 
 
 def _step_device(
     parameter: nn.Parameter, state: dict[str, Tensor], lr: float | Tensor, beta1: float, beta2: float, eps: float
 ) -> None:
     """The step as one kernel; clears the gradient."""
-    from sl_nerfstudio.field.device_kernels import launch
-    from sl_nerfstudio.field.warp_kernels import row_adam
+    from sl_nerfstudio.field.triton_backend import step_table
 
     assert parameter.grad is not None
     rate = lr.reshape(1) if isinstance(lr, Tensor) else torch.full((1,), lr, device=parameter.device)
-    most = float(len(_corrections(beta1, beta2)) - 1)
-    tensors = (parameter, parameter.grad, state["moments"], state["steps"], rate)
-    logarithms = [math.log(beta) if beta > 0 else -math.inf for beta in (beta1, beta2)]
-    launch(row_adam, len(parameter), *tensors, *logarithms, most, eps)
+    most = len(_corrections(beta1, beta2)) - 1
+    step_table(parameter, parameter.grad, state["moments"], state["steps"], rate, (beta1, beta2), most, eps)
     increment_version([parameter, parameter.grad])
 
 

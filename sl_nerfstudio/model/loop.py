@@ -23,6 +23,7 @@ from sl_nerfstudio.console import Phase, paragraph, phase
 from sl_nerfstudio.errors import UserError, last_line
 from sl_nerfstudio.field import numba_backend
 from sl_nerfstudio.field.backend import TableGradient
+from sl_nerfstudio.field.device_kernels import give_up
 from sl_nerfstudio.field.field import MIN_RESOLUTION, FieldConfig, SDFField
 from sl_nerfstudio.field.optimiser import RowAdam
 from sl_nerfstudio.field.simd import needs_compiling
@@ -185,8 +186,13 @@ class CudaRecorder:
         graph = torch.cuda.CUDAGraph()
         for generator in self._generators:
             graph.register_generator_state(generator)
-        with torch.cuda.graph(graph, stream=self._stream):
-            result = work()
+        try:  # other threads, such as the viewer's, may use the GPU meanwhile
+            with torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"):
+                result = work()
+        except RuntimeError:
+            with suppress(RuntimeError, AttributeError):  # else torch's allocator keeps to the recording's memory
+                torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), graph.pool())
+            raise
         return graph.replay, result
 
 
@@ -329,6 +335,7 @@ class SLTrainer(Trainer):
             with self.train_lock:
                 self._adjust_poses()
         finish()
+        self._compile_kernels()
         if several():
             share_state(self._model)
             self._model.load_state_dict(self._model.state_dict())  # modules look again at what the host must know
@@ -344,6 +351,24 @@ class SLTrainer(Trainer):
         with INTERRUPTION.held():
             self._model.measure_noise(samples)
             self.save_checkpoint(-1)
+
+    def _compile_kernels(self) -> None:
+        """Compile a GPU's kernels before the first step; if that fails, plain torch computes the steps."""
+        model = self._model
+        if torch.device(self.device).type != "cuda" or model.field.config.backend == "torch":
+            return
+        why = model.field.obstacle("triton")
+        if why is None and model.has_kernels:
+            from sl_nerfstudio.model.kernel_step import compile_kernels  # imports Triton
+
+            try:
+                with _shown_phase("compile") as shown:
+                    compile_kernels(model, self.pipeline.datamanager.train_pixel_sampler)
+                    shown.say("kernels for this GPU")
+            except Exception as error:  # whatever a driver, a compiler or a cache folder does
+                why = give_up(error)
+        if why is not None and comms.is_main_process():
+            print(paragraph("kernels", f"Plain torch computes the steps, which is slower: {why}."), flush=True)
 
     def begin_step(self, step: int) -> None:
         """Before each step, and before anything else in it."""

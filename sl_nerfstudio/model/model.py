@@ -350,7 +350,7 @@ class SLModel(Model):
         """Whether there are kernels for a whole step: not for triangulated points from which poses learn."""
         poses = self.device_poses
         moves = poses.camera_step.requires_grad or poses.projector_step.requires_grad
-        return self.field.backend == "warp" and not (moves and self.config.losses.direct)
+        return self.field.backend == "triton" and not (moves and self.config.losses.direct)
 
     def _renders(self, step: int) -> bool:
         return step >= self.config.warm_start * self.config.schedule_iterations
@@ -507,4 +507,4 @@ def _read_step(model: SLModel, _: object) -> None:
 def _corrected(bundle: RayBundle, views: Tensor, now: FrameTransforms) -> tuple[Tensor, Tensor]:
     """Move rays from the starting pose, at which they were made, to the current one."""
     directions = rotate(now.correction[views], bundle.directions)
-    return now.camera_centre[views], directions / directions.norm(dim=-1, keepdim=True)
+    return now.T_scene_camera[views, :3, 3], directions / directions.norm(dim=-1, keepdim=True)

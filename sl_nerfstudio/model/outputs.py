@@ -160,6 +160,7 @@ class History(nn.Module):
         self.names = tuple(names)
         self.register_buffer("table", torch.full((_ROWS, len(names) + 1), float("nan"), dtype=torch.float64))
         self._used = 0  # rows
+        self._arrived: Tensor | None = None
         self.every = 5
         """Steps between two entries."""
         self.register_buffer("state", torch.tensor([self._used, self.every]))  # the same two, for the checkpoint
@@ -175,6 +176,7 @@ class History(nn.Module):
         row = self.table[self._used]
         row[1:] = torch.stack([values.get(name, row[0]) for name in self.names])  # unused rows are NaN
         row[0].fill_(step)
+        self._send(row)
         self._used += 1
         if self._used == _ROWS:
             kept = self.table[::2].clone()
@@ -184,8 +186,17 @@ class History(nn.Module):
             self.every *= 2
 
     def latest(self, name: str) -> float:
-        """The value of the last row, NaN if there is none."""
-        return float(self.table[self._used - 1, 1 + self.names.index(name)]) if self._used else float("nan")
+        """The value of the last row that has arrived at the host since the start, NaN if there is none."""
+        return float("nan") if self._arrived is None else float(self._arrived[1 + self.names.index(name)])
+
+    def _send(self, row: Tensor) -> None:
+        """Copy a row to where the host reads it without waiting: from a GPU it arrives when the GPU is that far."""
+        if row.device.type == "cpu":
+            self._arrived = row.clone()
+            return
+        if self._arrived is None:
+            self._arrived = torch.full((len(row),), float("nan"), dtype=row.dtype, device="cpu", pin_memory=True)
+        self._arrived.copy_(row, non_blocking=True)
 
     def curves(self) -> dict[str, list[float]]:
         """Columns by name, `step` first."""

@@ -133,7 +133,7 @@ class SLPipeline(VanillaPipeline):
     - Evaluation uses held-out pixels of every frame, not whole images that were used for training.
     - After a checkpoint is loaded for viewing or export, cameras are at their refined poses.
     - The viewer shows the scan (viewer.py), and at the end of training the next commands are printed.
-    - On a GPU, kernels compute the losses of a step (warp_step.py).
+    - On a GPU, kernels compute the losses of a step (kernel_step.py).
     - Several processes average their gradients without DistributedDataParallel (processes.py).
     """
 
@@ -172,10 +172,10 @@ class SLPipeline(VanillaPipeline):
         sampler, model = self.datamanager.train_pixel_sampler, self._sl_model
         if sampler.samples.device != model.pattern.device or not model.has_kernels:
             return super().get_train_loss_dict(step)
-        from sl_nerfstudio.model.warp_step import kernel_step  # imports Warp
+        from sl_nerfstudio.model.kernel_step import kernel_step  # imports Triton
 
         self.datamanager.train_count += 1
-        return {}, *kernel_step(model, sampler.samples, sampler.choose(step))
+        return {}, *kernel_step(model, sampler.samples, sampler.choose(step), model.renders_now)
 
     @property
     def _sl_model(self) -> SLModel:

@@ -22,7 +22,7 @@ ProjectorMoves = Literal["nothing", "relative pose", "own pose"]
 class FrameTransforms:
     """What rays need of the current poses, in float32."""
 
-    camera_centre: Float[Tensor, "frames 3"]
+    T_scene_camera: Float[Tensor, "frames 4 4"]
     correction: Float[Tensor, "frames 4 4"]  # from the starting pose of the camera, at which rays are made
     T_scene_projector: Float[Tensor, "frames 4 4"]
     T_projector_scene: Float[Tensor, "frames 4 4"]
@@ -142,7 +142,7 @@ class PoseParameters(nn.Module):
     def _transforms(self) -> FrameTransforms:
         camera, projector = self()
         correction = (camera @ inverse(self.start_camera)).float()
-        return FrameTransforms(camera[:, :3, 3].float(), correction, projector.float(), inverse(projector).float())
+        return FrameTransforms(camera.float(), correction, projector.float(), inverse(projector).float())
 
     def _apply(self, fn: Any, recurse: bool = True) -> Any:
         self._fixed = None  # torch moves parameters and buffers to another device

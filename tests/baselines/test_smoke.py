@@ -46,7 +46,7 @@ def test_flags_have_the_kinds_of_their_defaults(monkeypatch):
 
 
 def test_rows_are_kept_from_run_to_run(tmp_path, capsys):
-    row = Row("paper", "warp", 1, 2, 3, 4, 5, 6, 7, {"add": 1})
+    row = Row("paper", "triton", 1, 2, 3, 4, 5, 6, 7, {"add": 1})
     Rows(tmp_path / "r.json", seed=3).add(row)
     assert shown(row) in capsys.readouterr().out
     assert json.loads((tmp_path / "r.json").read_text())["seed"] == 3

@@ -12,7 +12,7 @@ from sl_nerfstudio.field.torch_backend import knee
 from tests.field.fields import make_field, plain_sdf, points_around, relative
 
 CASES = [("torch", torch.float64, 1e-12), ("torch", torch.float32, 1e-5), ("numba", torch.float32, 1e-5)]
-CASES += [("warp", torch.float32, 1e-5)]
+CASES += [("triton", torch.float32, 1e-5)]
 WEIGHTS = torch.tensor([1.0, 0.5, 0.0, 0.25])
 
 
@@ -79,7 +79,7 @@ def test_starts_as_a_sphere() -> None:
     assert float(direction[p.norm(dim=-1) > 0.2].min()) > 0.9
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba", "warp"])
+@pytest.mark.parametrize("backend", ["torch", "numba", "triton"])
 def test_outside_the_box_it_grows_by_the_distance_from_it(backend: str) -> None:
     field = make_field(backend)
     on_face = torch.tensor([[1.0, 0.3, -0.2], [0.1, -1.0, 0.7], [1.0, 1.0, -1.0]])
@@ -91,7 +91,7 @@ def test_outside_the_box_it_grows_by_the_distance_from_it(backend: str) -> None:
     torch.testing.assert_close(slope, torch.ones(3), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba", "warp"])
+@pytest.mark.parametrize("backend", ["torch", "numba", "triton"])
 def test_nan_points_give_nan_values_and_do_not_affect_others(backend: str) -> None:
     field = make_field(backend)
     p = points_around(200).float()
@@ -226,7 +226,7 @@ def test_state_dict_and_copies_carry_the_whole_field() -> None:
     assert torch.equal(copy.deepcopy(field).sdf(p), field.sdf(p))
 
 
-@pytest.mark.parametrize("backend", ["torch", "numba", "warp"])
+@pytest.mark.parametrize("backend", ["torch", "numba", "triton"])
 def test_mixed_precision_does_not_affect_the_field(backend: str) -> None:
     field, p = make_field(backend), points_around(50).float()
     exact = field.sdf(p)

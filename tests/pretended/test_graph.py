@@ -19,7 +19,7 @@ def with_backend(backend, config):
 
 
 def trained(begin, recorder, method, backend, steps):
-    with PretendedGpu(kernels=backend == "warp") as gpu:
+    with PretendedGpu(kernels=backend == "triton") as gpu:
         training = begin(method, partial(with_backend, backend))
         used = None
         if recorder is not None:
@@ -32,7 +32,7 @@ def trained(begin, recorder, method, backend, steps):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method, backend, steps", [("sl-neus", "warp", 10), ("sl-neus-paper", "warp", 5)])
+@pytest.mark.parametrize("method, backend, steps", [("sl-neus", "triton", 10), ("sl-neus-paper", "triton", 5)])
 def test_a_recording_gives_the_same_training(begin, method, backend, steps):
     recorder, rates, recorded = trained(begin, PretendedRecorder, method, backend, steps)
     assert recorder is not None
@@ -66,7 +66,7 @@ def test_a_step_that_waits_is_not_recorded_and_training_goes_on(begin, capsys):
             graph.step(0)
         with pytest.raises(NotRecordedError, match="not permitted when stream is capturing"):
             graph.step(0)
-        training = begin("sl-neus-paper", partial(with_backend, "warp"))
+        training = begin("sl-neus-paper", partial(with_backend, "triton"))
 
         def record(work):
             raise RuntimeError("first line\nthis GPU is too old")

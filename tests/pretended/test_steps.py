@@ -8,6 +8,7 @@ import torch
 from benchmarks.pretended.gpu import MixedDevicesError, PretendedGpu
 from sl_nerfstudio.bundle_adjustment.adjust import CrossValidation
 from sl_nerfstudio.bundle_adjustment.covariance import joint_of_prior
+from sl_nerfstudio.field import device_kernels
 from sl_nerfstudio.model.pose_refinement import ScanAdjustment, pose_prior, scene_rig
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
@@ -32,13 +33,13 @@ def adjusted_at_once(scan, S_scene_world, samples, refine, prior, settings):
     "method, refine, poses, backend",
     [
         ("sl-neus", "off", "adjust", "torch"),  # fixed
-        ("sl-neus", "free", "adjust", "warp"),  # refined before the first step
-        ("sl-neus", "rigid-rig", "render", "warp"),  # trained
+        ("sl-neus", "free", "adjust", "triton"),  # refined before the first step
+        ("sl-neus", "rigid-rig", "render", "triton"),  # trained
         ("sl-neus-paper", "free", "render-independently", "torch"),
     ],
 )
 def test_no_step_waits_for_the_gpu(begin, monkeypatch, method, refine, poses, backend):
-    with PretendedGpu(kernels=backend == "warp") as gpu:
+    with PretendedGpu(kernels=backend == "triton") as gpu:
         training = begin(method, partial(with_poses, refine, poses, backend))
         if refine == "free" and poses == "adjust":
             monkeypatch.setattr("sl_nerfstudio.model.model.adjust_scan", adjusted_at_once)
@@ -49,6 +50,7 @@ def test_no_step_waits_for_the_gpu(begin, monkeypatch, method, refine, poses, ba
         for step in range(RENDERED_FROM + 2):
             with gpu.counting() as seen:
                 loss, terms, metrics = training.step()
+                training.after()
             if step not in (0, RENDERED_FROM):  # constants are copied once
                 assert not seen.waits, f"step {step}: {dict(seen.waits)}"
             assert seen.launches.total() > 20
@@ -58,6 +60,29 @@ def test_no_step_waits_for_the_gpu(begin, monkeypatch, method, refine, poses, ba
         assert {"field.encoding.table", "field.mlp.0.weight"} <= moved
         assert ("device_poses.camera_step" in moved) == (poses != "adjust")
         assert training.model.history()["step"] == [0.0]
+
+
+def test_kernels_that_do_not_compile_are_said_before_the_first_step_and_plain_torch_is_used(begin, monkeypatch, capsys):
+    monkeypatch.setattr(device_kernels, "_failures", [])
+    with PretendedGpu(kernels=True) as gpu:
+        training = begin("sl-neus", partial(with_poses, "off", "adjust", "auto"))
+        before = {name: x.detach().clone() for name, x in training.model.named_parameters()}
+        training.trainer._compile_kernels()
+        assert all(torch.equal(x, before[name]) for name, x in training.model.named_parameters())
+        assert training.model.field.backend == "triton" and "kernels for this GPU" in capsys.readouterr().out
+
+        def full(*_):
+            raise OSError(28, "No space left on device", "/root/.triton")
+
+        monkeypatch.setattr(device_kernels, "run", full)
+        training.trainer._compile_kernels()
+        said = " ".join(capsys.readouterr().out.split())
+        assert "Plain torch computes the steps, which is slower:" in said
+        assert "TRITON_CACHE_DIR may name a folder" in said
+        assert training.model.field.backend == "torch"
+        with gpu.counting() as seen:
+            training.step()
+        assert not [name for name in seen.launches if "triton" in name]
 
 
 def test_a_pixel_table_that_does_not_fit_is_copied_batch_by_batch(begin, monkeypatch):

@@ -10,8 +10,8 @@ from torch import Tensor
 from benchmarks.common.training import Training, settings
 from sl_nerfstudio.field.device_kernels import launches
 from sl_nerfstudio.geometry.lie import exp_se3
+from sl_nerfstudio.model.kernel_step import device_poses
 from sl_nerfstudio.model.poses import PoseParameters
-from sl_nerfstudio.model.warp_step import device_poses
 from tests.dataparser.tiny_scan import TinyScan
 
 FRAMES = 5
@@ -67,13 +67,13 @@ def training(method: str, backend: str, scan_root: Path, folder: Path) -> Traini
 def test_a_training_by_kernels_goes_as_one_by_plain_operations(method: str, scan_root: Path, tmp_path: Path) -> None:
     """Other random numbers, but the same start and the same pixels: after 25 steps, losses are alike."""
     terms = []
-    for backend in ("numba", "warp"):
+    for backend in ("numba", "triton"):
         run = training(method, backend, scan_root, tmp_path)
         seen = []
         for _ in range(25):
             with launches() as kernels:
                 seen.append(run.step())
-        assert bool(kernels) == (backend == "warp") and len(kernels) <= 30
+        assert bool(kernels) == (backend == "triton") and len(kernels) <= 30
         last = {name: sum(float(step[1][name]) for step in seen[-8:]) for name in seen[-1][1]}
         last["px"] = sum(float(step[2]["coordinate_px"]) for step in seen[-8:])
         terms.append((last, float(run.model.device_poses.camera_step.detach().abs().sum())))
@@ -86,7 +86,7 @@ def test_a_training_by_kernels_goes_as_one_by_plain_operations(method: str, scan
 
 def test_triangulated_points_from_which_poses_learn_have_no_kernels(scan_root: Path, tmp_path: Path) -> None:
     config = settings("sl-neus", scan_root, tmp_path, "cpu", 5)
-    config.pipeline.model.sdf.backend, config.pipeline.model.pose_method = "warp", "render"
+    config.pipeline.model.sdf.backend, config.pipeline.model.pose_method = "triton", "render"
     config.pipeline.model.sdf.log2_table_size, config.pipeline.datamanager.train_num_rays_per_batch = 10, 64
     run = Training(config)
     assert not run.model.has_kernels

@@ -1,26 +1,27 @@
-"""The losses of a training step on a GPU: a few kernels around one evaluation of the field.
+"""The losses of a training step on a GPU: a few kernels in Triton around one evaluation of the field.
 
 Numbers and gradients are those of `renderer.py`, `volume_rendering.py`, `losses.py` and `direct_losses.py`, which take
 a thousand operations for them. Nothing waits for the GPU, and everything that changes from step to step is read there.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import torch
+import triton
 from jaxtyping import Float, Float64, Int16, Int32, Int64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from sl_nerfstudio.field.device_kernels import launch
-from sl_nerfstudio.geometry.devices import MODELS, Intrinsics
-from sl_nerfstudio.rendering import warp_kernels as direct_kernels
-from sl_nerfstudio.rendering import warp_kernels as point_kernels
-from sl_nerfstudio.rendering import warp_kernels as ray_kernels
+from sl_nerfstudio.field.device_kernels import block, launch
+from sl_nerfstudio.geometry.devices import Intrinsics
+from sl_nerfstudio.rendering import triton_kernels as kernels
 from sl_nerfstudio.rendering.losses import LossConfig
-from sl_nerfstudio.rendering.renderer import HALF_WIDTH, SamplingConfig
+from sl_nerfstudio.rendering.renderer import CACHE_SAMPLES, HALF_WIDTH, SamplingConfig
 
-_SUMS = 14  # see the kernels; the last one stays 0
+_SUMS = 15  # see the kernels; the last one stays 0
+_POINTS, _ELEMENTS = 256, 256  # of a program: points; samples on rays
 
 
 @runtime_checkable
@@ -128,10 +129,6 @@ def step_losses(
     return StepLosses(terms, px, cosine) if step.rendered else StepLosses(terms, None, None)
 
 
-def _model(intrinsics: Intrinsics) -> tuple[int, int]:
-    return MODELS[intrinsics.model].code, int(intrinsics.distorted)
-
-
 class _Zeros:
     """All that begins as 0 in a step, set by one launch: the sums, and the adjoints of the two devices' poses."""
 
@@ -156,29 +153,25 @@ class _Points(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         x, devices, current = step.pixels, step.devices, step.current
         rays, r, n = len(x.index), step.rendered, step.direct
-        m, samples = step.sampling.eikonal_points, step.sampling.samples
+        m, samples, resolution = step.sampling.eikonal_points, step.sampling.samples, len(step.cache)
         empty = T_scene_camera.new_empty
         origins, directions, measured = empty(rays, 3), empty(rays, 3), empty(rays, 2)
         views, captured = empty(rays, dtype=torch.int32), empty(rays)
-        table = (x.index, x.among, x.frame, x.row, x.column, x.coords, x.pattern)
-        cameras = (devices.cameras.params, *_model(devices.cameras))
         noise = torch.rand(r * samples + 3 * n + 3 * m, device=origins.device)
-        t, points = empty(r, samples), empty(step.without_gradients + n + m, 3)
-        others = points[step.without_gradients :]  # triangulated points, then random ones
-        found = (views, origins, directions, measured, captured, noise[r * samples + 3 * n :], others[n:])
-        launch(point_kernels.rays_and_random_points, max(rays, m), *table, T_scene_camera, *cameras, *found)
-        weight, at_least = empty(n), empty(n)
-        if r:
-            surface = (int(step.sampling.strategy == "surface"), 2 / (len(step.cache) - 1), HALF_WIDTH)
-            where = (step.cache, *surface, current.kappa.reshape(1))
-            launch(point_kernels.sample, r, origins, directions, noise, *where, t, points)
-        if n:
-            projector = (devices.projector.params, *_model(devices.projector))
-            scale = (current.noise_px.reshape(1), current.px_per_length.reshape(1))
-            given = (origins, directions, views, T_scene_projector, measured, *projector, *scale)
-            made = (others, points[r * samples :], weight, at_least)
-            launch(point_kernels.triangulate, n, *given, noise[r * samples :], *made)
-        ctx.rendered, ctx.zeros = r, zeros
+        t, points, weight, at_least = empty(r, samples), empty(step.without_gradients + n + m, 3), empty(n), empty(n)
+        table = (x.index, x.among, x.frame, x.row, x.column, x.coords, x.pattern)
+        poses = (T_scene_camera, devices.cameras.params, T_scene_projector, devices.projector.params)
+        scalars = (current.kappa, current.noise_px, current.px_per_length)
+        found = (views, origins, directions, measured, captured, t, points, weight, at_least)
+        constants = {
+            "STRIDES": tuple(column.stride(0) for column in table[2:]),
+            "AMONG": len(x.among) > 0, "CAMERA_DOE": devices.cameras.model == "DOE",
+            "CAMERA_DISTORTED": devices.cameras.distorted, "RENDERS": r > 0, "DIRECT": n > 0,
+            "SURFACE": step.sampling.strategy == "surface", "HALF_WIDTH": HALF_WIDTH,
+        }  # fmt: skip
+        arrays = (*table, *poses, noise, step.cache, *scalars, *found, rays, r, m, resolution)
+        _along_rays(step, kernels.begin_rays, max(rays, m), *arrays, **constants)
+        ctx.step, ctx.zeros = step, zeros
         ctx.save_for_backward(T_scene_camera, views, directions, t)
         ctx.mark_non_differentiable(views, t, measured, captured, weight, at_least)
         return origins, directions, points, views, t, measured, captured, weight, at_least
@@ -188,9 +181,9 @@ class _Points(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
         T, views, directions, t = ctx.saved_tensors
         d_origins, d_directions, d_points = (x.contiguous() for x in grad_outputs[:3])
-        d_T = ctx.zeros.adjoint("cameras", T)
+        d_T, r = ctx.zeros.adjoint("cameras", T), ctx.step.rendered
         adjoints = (d_points, d_origins, d_directions, d_T)
-        launch(point_kernels.rays_adjoint, ctx.rendered, T, views, directions, t, *adjoints)
+        _along_rays(ctx.step, kernels.rays_adjoint, r, T, views, directions, t, *adjoints, r)
         return None, None, d_T, None
 
 
@@ -199,20 +192,19 @@ class _Losses(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, step: Step, zeros: _Zeros, *tensors: Tensor) -> tuple[Tensor, ...]:
-        f, slopes, _, _, _, _, t, *_ = tensors
-        r, current, w = step.rendered, step.current, step.losses
-        sums, found = zeros.sums, f.new_empty(7)
-        before, coordinates = torch.empty_like(t), f.new_empty(r, 2)
-        rendered, lit, lit_weight, error = f.new_empty(4, r).unbind()
+        f, slopes, *_ = tensors
+        r, sums, found, error = step.rendered, zeros.sums, f.new_empty(7), f.new_empty(step.rendered)
         if r:
-            outputs = (before, coordinates, rendered, lit, lit_weight, error)
-            launch(ray_kernels.render, r, *_rendering(step, tensors), *outputs, sums)
+            outputs = (error, sums, r, *step.devices.pattern.shape)
+            _along_rays(step, kernels.render, r, *_rendering(step, tensors), *outputs)
             error = error.sort().values
-        launch(direct_kernels.direct, len(slopes), *_on_points(step, tensors), current.surface_width.reshape(1), sums)
-        scale = (current.px_per_length.reshape(1), *_coordinate_weights(w))
-        launch(direct_kernels.losses, 1, sums, *scale, w.pattern, w.surface, w.free_space, w.eikonal, error, found)
+        size = block(_POINTS, len(slopes))
+        arrays = (*_on_points(step, tensors), sums, *_counts(step))
+        launch(kernels.direct, triton.cdiv(len(slopes), size), *arrays, BLOCK=size)
+        constants = {**_coordinate_weights(step.losses), **_weights_of(step.losses), "PATTERN": step.losses.pattern}
+        launch(kernels.losses, 1, sums, step.current.px_per_length, error, found, **constants, num_warps=1)
         ctx.step, ctx.zeros = step, zeros
-        ctx.save_for_backward(*tensors, before, coordinates, rendered, lit, lit_weight, sums)
+        ctx.save_for_backward(*tensors, sums)
         outputs = found.unbind()
         ctx.mark_non_differentiable(*outputs[5:])
         ctx.set_materialize_grads(False)
@@ -222,39 +214,63 @@ class _Losses(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor | None) -> Any:
         step: Step = ctx.step
-        tensors, kept = ctx.saved_tensors[:11], ctx.saved_tensors[11:]
-        f, slopes, origins, _, T, _, t, *_ = tensors
-        r, current, w, sums = step.rendered, step.current, step.losses, kept[-1]
-        g = [sums[-1:] if x is None else x.reshape(1) for x in grad_outputs[:5]]
+        *tensors, sums = ctx.saved_tensors
+        f, slopes, origins, _, T, *_ = tensors
+        r, w = step.rendered, step.losses
+        g = [sums[-1] if x is None else x for x in grad_outputs[:5]]
         d_f, d_slopes = torch.empty_like(f), torch.empty_like(slopes)
         by_rays, by_pose = any(ctx.needs_input_grad[4:6]), ctx.needs_input_grad[6]
         d_rays = (f.new_empty if r == len(origins) else f.new_zeros)(2, len(origins) if by_rays else 0, 3)
         d_T = ctx.zeros.adjoint("projectors", T) if by_pose else f.new_empty(0, 4, 4)
         if r:
-            scale = (current.px_per_length.reshape(1), *_coordinate_weights(w), w.pattern)
-            adjoints = (d_f[: t.numel()].view(t.shape), d_rays[0], d_rays[1], d_T)
-            launch(ray_kernels.render_adjoint, r, *_rendering(step, tensors), *kept, *scale, *g[:2], *adjoints)
-        scale = (current.surface_width.reshape(1), sums, w.surface, w.free_space, w.eikonal)
-        adjoints = (d_f[step.without_gradients :], d_slopes, d_f[t.numel() :])
-        launch(direct_kernels.direct_adjoint, len(slopes), *_on_points(step, tensors), *scale, *g[2:], *adjoints)
+            adjoints = (sums, step.current.px_per_length, *g[:2], d_f, d_rays[0], d_rays[1], d_T)
+            constants = {**_coordinate_weights(w), "PATTERN": w.pattern, "RAYS": by_rays, "POSES": by_pose}
+            shape = step.devices.pattern.shape
+            _along_rays(step, kernels.render_adjoint, r, *_rendering(step, tensors), *adjoints, r, *shape, **constants)
+        size = block(_POINTS, len(slopes))
+        arrays = (*_on_points(step, tensors), sums, *g[2:], d_f, d_slopes, *_counts(step))
+        launch(kernels.direct_adjoint, triton.cdiv(len(slopes), size), *arrays, **_weights_of(w), BLOCK=size)
         rays = (d_rays[0], d_rays[1]) if by_rays else (None, None)
         return None, None, d_f, d_slopes, *rays, d_T if by_pose else None, *[None] * 6
 
 
-def _rendering(step: Step, tensors: tuple[Tensor, ...]) -> tuple[Any, ...]:
+def _along_rays(step: Step, kernel: Any, n: int, *arguments: Any, **constants: Any) -> None:
+    """Launch a kernel for n rays, each with its samples."""
+    columns = triton.next_power_of_2(step.sampling.samples)
+    widest = max(columns, CACHE_SAMPLES if kernel is kernels.begin_rays else 1)
+    size = block(max(_ELEMENTS // widest, 1), n)
+    projector = step.devices.projector
+    if kernel is not kernels.rays_adjoint:
+        constants |= {"DOE": projector.model == "DOE", "DISTORTED": projector.distorted}
+    shape = {"SAMPLES": step.sampling.samples, "COLUMNS": columns, "BLOCK": size}
+    launch(kernel, triton.cdiv(n, size), *arguments, **constants, **shape)
+
+
+def _rendering(step: Step, tensors: Sequence[Tensor]) -> tuple[Any, ...]:
     """What the kernels along rays read."""
     f, _, origins, directions, T, views, t, measured, captured, *_ = tensors
-    projector = (step.devices.projector.params, *_model(step.devices.projector), step.devices.pattern)
-    sdf = f[: t.numel()].view(t.shape)
-    return sdf, t, origins, directions, T, views, *projector, step.current.kappa.reshape(1), measured, captured
+    projector = (step.devices.projector.params, step.devices.pattern)
+    return f, t, origins, directions, T, views, *projector, step.current.kappa, measured, captured
 
 
-def _on_points(step: Step, tensors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+def _on_points(step: Step, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """What the kernels on triangulated and random points read."""
-    f, slopes, _, directions, _, _, t, measured, _, weight, at_least = tensors
-    return f[step.without_gradients :], slopes, f[t.numel() :], directions, measured, weight, at_least
+    f, slopes, _, directions, _, _, _, measured, _, weight, at_least = tensors
+    return f, slopes, directions, measured, weight, at_least, step.current.surface_width
 
 
-def _coordinate_weights(w: LossConfig) -> tuple[float, float]:
+def _counts(step: Step) -> tuple[int, int, int]:
+    """The first point on a side of the surface, triangulated points, and others."""
+    return step.rendered * step.sampling.samples, step.direct, step.sampling.eikonal_points
+
+
+def _coordinate_weights(w: LossConfig) -> dict[str, float]:
     """Weight of the coordinates' error as a length, or, if that is 0, per pattern pixel."""
-    return (w.coordinates, 0.0) if w.coordinates_per_pixel is None else (0.0, w.coordinates_per_pixel)
+    if w.coordinates_per_pixel is None:
+        return {"PER_LENGTH": w.coordinates, "PER_PIXEL": 0.0}
+    return {"PER_LENGTH": 0.0, "PER_PIXEL": w.coordinates_per_pixel}
+
+
+def _weights_of(w: LossConfig) -> dict[str, float]:
+    """Weights of the terms on points."""
+    return {"SURFACE": w.surface, "FREE_SPACE": w.free_space, "EIKONAL": w.eikonal}
