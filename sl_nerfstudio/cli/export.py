@@ -424,7 +424,11 @@ def _pictures(exported: "Exported") -> str:
     if pictures is None:
         return "no pictures"
     least, most = pictures.gains.min(), pictures.gains.max()
-    differ = f" (exposures from {least:.2f} to {most:.2f} of their mean, evened out)" * (most > _SAME_EXPOSURE * least)
+    differ = (
+        f" (exposures from {least:.2f} to {most:.2f} of their mean, evened out)"
+        if most > _SAME_EXPOSURE * least
+        else ""
+    )
     return f"{len(pictures)} pictures without the pattern{differ}"
 
 
