@@ -161,7 +161,6 @@ class Progress:
                     f"{self._path}: cannot be read\n    cause:  the file was edited or damaged\n"
                     "    remedy: give a new folder with --output; sl-process finds again what was decoded"
                 ) from error
-        self._write()
 
     def is_done(self, stage: str, key: str, results: tuple[str, ...]) -> bool:
         """Whether the stage is complete for the same inputs, and its results are there."""
@@ -186,11 +185,6 @@ class Progress:
         yield
         self.stages[stage] = key
         self.files |= {name: _digest(self.root / name) for name in results}
-        self._write()
-
-    def note(self, name: str, value: str) -> None:
-        """Note something for the next command."""
-        self.stages[name] = value
         self._write()
 
     def _is_anothers(self, name: str) -> bool:
@@ -242,7 +236,7 @@ class Work:
         """Make the scan folder, unless it was made of the same photographs with the same flags."""
         config = self.config.processing()
         paths = (config.images, config.pattern, config.intrinsics, config.masks, config.color)
-        key = _key(config, [_state_of(path) for path in paths])
+        key = _key(replace(config, output=Path()), [_state_of(path) for path in paths])
         if self.done.is_done("process", key, ("scan/transforms.json",)):
             return say(_kept("process", config.output))
         say(_heading("process"))
@@ -270,12 +264,15 @@ class Work:
         if self.done.is_done("train", key, ()) and trained:
             say(_kept("train", trained[0].parent))
             return trained[0]
-        with phase("start"), compiler_left_out():
-            from nerfstudio.scripts import train
+        with phase("start"):
+            from sl_nerfstudio.late_imports import compiler_on_demand
 
-            from sl_nerfstudio.model.run_files import part_of, quiet_nerfstudio, read_checkpoint
-            from sl_nerfstudio.runs.other_length import follow_scan, training_key
-            from sl_nerfstudio.runs.run import last_checkpoint
+            with compiler_on_demand(stays_out=True):
+                from nerfstudio.scripts import train
+
+                from sl_nerfstudio.model.run_files import part_of, quiet_nerfstudio, read_checkpoint
+                from sl_nerfstudio.runs.other_length import follow_scan, training_key
+                from sl_nerfstudio.runs.run import last_checkpoint
 
         quiet_nerfstudio(True)
         digest = _key(training_key(self.scan), refined, steps)[:12]
@@ -294,7 +291,7 @@ class Work:
                 say(_heading("train"))
                 with part_of(shlex.join(self.config.words)):
                     train.main(config)
-        self.done.note("run", digest)
+            self.done.stages["run"] = digest
         return path
 
     def export(self, run_config: Path) -> str:
@@ -345,15 +342,6 @@ def _heading(stage: str) -> str:
 
 def _kept(stage: str, where: Path) -> str:
     return f"-- {stage}: as before, in {short_path(where)}"
-
-
-@contextmanager
-def compiler_left_out() -> Iterator[None]:
-    """Import nerfstudio without torch's compiler, which takes seconds."""
-    from sl_nerfstudio.late_imports import compiler_on_demand
-
-    with compiler_on_demand(stays_out=True):
-        yield
 
 
 def _settings(scan: Path, output: Path, name: str, steps: int, refined: str) -> Any:

@@ -154,7 +154,8 @@ def write_scan(
 ) -> None:
     """Write all frames that are in the scan by `result`. Leaving the folder completes it.
 
-    `pictures` are those without the pattern, by the frame's name; of a sequence, the image in full light is one.
+    `pictures` are those without the pattern, by the frame's name; if there are none, a sequence has its images in full
+    light.
     """
     layout = job.decoder.layout
     white = layout.place(ShownImage("white")) if isinstance(layout, GrayCode) else None
@@ -190,7 +191,7 @@ def write_scan(
                 mask=decoded.mask & keep,
                 pattern=np.rint(255 * decoded.pattern * keep).astype(np.uint8),
                 color=None if picture is None else read_photograph(picture),
-                image_is_color=white is not None and picture is None,
+                image_is_color=white is not None and not pictures,
                 camera=job.camera_of(frame.frame) if job.cameras else None,
                 T_world_camera=poses.adjusted.poses.T_world_camera[k],
                 T_world_projector=poses.adjusted.poses.T_world_projector[k],
