@@ -13,7 +13,7 @@ from sl_nerfstudio.geometry.lie import exp_se3, inverse
 from sl_nerfstudio.model.pose_refinement import scene_rig
 from sl_nerfstudio.runs.other_length import follow_scan, training_key
 from sl_nerfstudio.runs.run import check_run, load_run
-from sl_nerfstudio.scan import read_scan
+from sl_nerfstudio.scan import measured_length, read_scan
 from tests.dataparser.tiny_scan import TinyScan
 from tests.test_ns_commands import train
 
@@ -45,7 +45,12 @@ def with_length(root: Path, factor: float, scale: dict) -> None:
             T = np.array(frame[key])
             T[:3, 3] *= factor
             frame[key] = T.tolist()
-    path.write_text(json.dumps(document | {"units": "cm", "scale": {"known": True, "source": "measured", **scale}}))
+    document |= {"units": "cm", "scale": {"known": True, "source": "measured", **scale}}
+    path.write_text(json.dumps(document))
+    scan = read_scan(root)
+    if scan.scale.bar is not None:  # the poses obey it as they do after sl-process
+        document["scale"]["length"] = 1.01 * measured_length(scan, scan.scale.bar, scan.poses)
+        path.write_text(json.dumps(document))
 
 
 def doubt_of_baseline(model) -> float:
