@@ -346,9 +346,9 @@ def _kept(stage: str, where: Path) -> str:
 
 def _settings(scan: Path, output: Path, name: str, steps: int, refined: str) -> Any:
     """The settings of ns-train sl-neus for a new run."""
-    from sl_nerfstudio.methods import sl_neus
+    from nerfstudio.configs.method_configs import method_configs
 
-    config: Any = deepcopy(sl_neus.config)
+    config: Any = deepcopy(method_configs["sl-neus"])
     config.data, config.output_dir, config.experiment_name, config.timestamp = scan, output, "training", name
     config.max_num_iterations, config.pipeline.model.refine_poses = steps, refined
     return config
