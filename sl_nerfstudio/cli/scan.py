@@ -8,11 +8,10 @@ import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from copy import deepcopy
 from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -268,13 +267,11 @@ class Work:
             from sl_nerfstudio.late_imports import compiler_on_demand
 
             with compiler_on_demand(stays_out=True):
-                from nerfstudio.scripts import train
-
-                from sl_nerfstudio.model.run_files import part_of, quiet_nerfstudio, read_checkpoint
+                from sl_nerfstudio.model.run_files import read_checkpoint
+                from sl_nerfstudio.model.train import settings_of_run, train_within
                 from sl_nerfstudio.runs.other_length import follow_scan, training_key
                 from sl_nerfstudio.runs.run import last_checkpoint
 
-        quiet_nerfstudio(True)
         digest = _key(training_key(self.scan), refined, steps)[:12]
         path = runs / f"{quality}-{digest}" / "config.yml"
         with self.done.making("train", key):
@@ -284,13 +281,13 @@ class Work:
                 complete = read_checkpoint(last_checkpoint(config, path)).step >= config.last_step
             else:
                 shutil.rmtree(path.parent, ignore_errors=True)  # stopped before it had saved anything
-                config, complete = _settings(self.scan_root, output, path.parent.name, steps, refined), False
+                config = settings_of_run(self.scan_root, output, "training", path.parent.name, steps, refined)
+                complete = False
             if complete:
                 say(_kept("train", path.parent))
             else:
                 say(_heading("train"))
-                with part_of(shlex.join(self.config.words)):
-                    train.main(config)
+                train_within(shlex.join(self.config.words), config)
             self.done.stages["run"] = digest
         return path
 
@@ -342,16 +339,6 @@ def _heading(stage: str) -> str:
 
 def _kept(stage: str, where: Path) -> str:
     return f"-- {stage}: as before, in {short_path(where)}"
-
-
-def _settings(scan: Path, output: Path, name: str, steps: int, refined: str) -> Any:
-    """The settings of ns-train sl-neus for a new run."""
-    from nerfstudio.configs.method_configs import method_configs
-
-    config: Any = deepcopy(method_configs["sl-neus"])
-    config.data, config.output_dir, config.experiment_name, config.timestamp = scan, output, "training", name
-    config.max_num_iterations, config.pipeline.model.refine_poses = steps, refined
-    return config
 
 
 def scan_photographs(config: ScanConfig) -> None:

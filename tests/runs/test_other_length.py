@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from sl_nerfstudio.bundle_adjustment.parameters import of_baselines
 from sl_nerfstudio.geometry.lie import exp_se3, inverse
-from sl_nerfstudio.model.pose_refinement import scene_rig
+from sl_nerfstudio.model.pose_refinement import PriorConfig, known_length, pose_prior, scene_rig
 from sl_nerfstudio.runs.other_length import follow_scan, training_key
 from sl_nerfstudio.runs.run import check_run, load_run
 from sl_nerfstudio.scan import measured_length, read_scan
@@ -53,12 +52,12 @@ def with_length(root: Path, factor: float, scale: dict) -> None:
         path.write_text(json.dumps(document))
 
 
-def doubt_of_baseline(model) -> float:
-    """How uncertain the logarithm of frame 1's baseline is."""
+def doubt_of_length(model, known) -> float:
+    """How uncertain a run finds the logarithm of the length that the scan of another one states."""
     camera, projector = model.poses_scene()
-    start = scene_rig(model.scan, model.S_scene_world)
-    rig = replace(start, T_world_camera=camera, T_camera_projector=inverse(camera) @ projector)
-    derivative = of_baselines(rig, 1)
+    scan, S = known.scan, known.S_scene_world
+    rig = replace(scene_rig(scan, S), T_world_camera=camera, T_camera_projector=inverse(camera) @ projector)
+    derivative = known_length(scan, S, "free", rig, pose_prior(scan, S, PriorConfig()))
     return float((derivative @ model.device_poses.joint_factor[: len(derivative)]).norm())
 
 
@@ -72,7 +71,6 @@ def test_a_run_that_follows_its_scan_equals_one_that_was_trained_with_the_length
     assert not torch.equal(camera.base_camera, camera.start_camera)  # the training had adjusted the poses
     with_length(root, 0.137, scale)
     assert training_key(read_scan(root)) == key
-    doubt_then = doubt_of_baseline(before)
     follow_scan(config, root, tmp_path / "first")
     check_run(config)
     found, wanted = load_run(config).model, load_run(train(monkeypatch, root, tmp_path / "second", 2)).model
@@ -83,11 +81,16 @@ def test_a_run_that_follows_its_scan_equals_one_that_was_trained_with_the_length
         T.T_world_camera[0, :3, :3].T @ (T.T_world_camera[:, :3, 3] - T.T_world_camera[0, :3, 3]).T for T in (a, b)
     ]
     np.testing.assert_allclose(relative[0], relative[1], rtol=1e-5, atol=1e-5 * a.baseline[0])
+    assert (
+        max(doubt_of_length(found, found), doubt_of_length(wanted, wanted))
+        < 1e-8
+        < 1e-5
+        < doubt_of_length(before, found)
+    )
     if scale is BASELINE:
         assert a.baseline[1] == pytest.approx(read_scan(root).poses.baseline[1], rel=1e-9)
-        assert doubt_of_baseline(found) < 1e-9 < 1e-5 < doubt_then
-    first, second = (factor @ factor.T for factor in (m.joint_covariance().factor for m in (found, wanted)))
-    np.testing.assert_allclose(first, second, rtol=0, atol=1e-2 * np.abs(second).max())
+        first, second = (factor @ factor.T for factor in (m.joint_covariance().factor for m in (found, wanted)))
+        np.testing.assert_allclose(first, second, rtol=0, atol=1e-2 * np.abs(second).max())
     follow_scan(config, root, tmp_path / "first")  # nothing to do
     with_length(root, 1 / 0.137, BASELINE)
     follow_scan(config, root, tmp_path / "first")
