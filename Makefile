@@ -15,9 +15,7 @@ DEMO := outputs/demo
 DEMO_RUN := $(DEMO)/run/cone-and-cylinder/sl-neus/demo
 DEMO_TRAINED = $(DEMO_RUN)/nerfstudio_models/step-000000999.ckpt
 IMAGES := outputs/demo-images
-IMAGES_RUN := $(IMAGES)/run/head/sl-neus/demo
-IMAGES_TRAINED = $(IMAGES_RUN)/nerfstudio_models/step-000000999.ckpt
-# The last checkpoint of a complete training.
+# DEMO_TRAINED: the last checkpoint of a complete training.
 
 # Takes the first of these that runs, has a supported version and can create virtual environments.
 # `make install PYTHON=/path/to/python3.12` selects another.
@@ -30,7 +28,7 @@ help:
 	@echo "make install   create .venv with pinned dependencies and this package"
 	@echo "make demo      synthesise, train, export and evaluate a scan: outputs/demo/report.html (minutes);"
 	@echo "                 if it was interrupted, it goes on where it was"
-	@echo "make demo-images   the same from images alone, with decoding, calibration and registration first (minutes)"
+	@echo "make demo-images   the same from images alone, by sl-scan (minutes)"
 	@echo "make test      run the tests that every change needs (minutes)"
 	@echo "make test-slow run the others: trainings, whole commands, sweeps over many cases"
 	@echo "make bench     run the benchmarks that take minutes; results in benchmarks/results/"
@@ -96,31 +94,23 @@ $(DEMO)/report.html: $(DEMO)/refined/training.json
 	$(BIN)/sl-eval --mesh $(DEMO)/mesh.ply --data $(DEMO)/scan --poses $(DEMO)/refined/transforms.json \
 	  --json $(DEMO)/evaluation.json --report $@
 
-demo-images: $(IMAGES)/report.html
-	@echo "report   $(abspath $(IMAGES)/report.html) (open it in a browser)"
+demo-images: $(IMAGES)/truth.html
+	@echo "report   $(abspath $(IMAGES)/result/report.html) (open it in a browser)"
+	@echo "compared with the true surface: $(abspath $(IMAGES)/truth.html)"
 
 $(IMAGES)/captures/intrinsics.json: | install
 	$(BIN)/sl-synth --output $(IMAGES)/captures --scene head --frames 22 --images-only \
 	  --appearance realistic --background table
 
-$(IMAGES)/scan/transforms.json: $(IMAGES)/captures/intrinsics.json
-	$(BIN)/sl-process --images $(IMAGES)/captures/images --pattern $(IMAGES)/captures/pattern.json \
-	  --intrinsics $(IMAGES)/captures/intrinsics.json --output $(IMAGES)/scan --object-only
+$(IMAGES)/result/report.html: $(IMAGES)/captures/intrinsics.json
+	$(BIN)/sl-scan $(IMAGES)/captures/images --pattern $(IMAGES)/captures/pattern.json \
+	  --intrinsics $(IMAGES)/captures/intrinsics.json --output $(IMAGES)/result --object-only
 
-$(IMAGES_TRAINED): $(IMAGES)/scan/transforms.json
-	if [ -e $(IMAGES_RUN)/config.yml ]; then $(BIN)/ns-train sl-neus --load-config $(IMAGES_RUN)/config.yml; \
-	else $(BIN)/ns-train sl-neus --data $(IMAGES)/scan --output-dir $(IMAGES)/run \
-	  --experiment-name head --timestamp demo; fi
-
-$(IMAGES)/refined/training.json: $(IMAGES_TRAINED)
-	$(BIN)/sl-export --load-config $(IMAGES_RUN)/config.yml --output $(IMAGES)/mesh.ply --poses $(IMAGES)/refined --overwrite
-
-# The truth is added to the scan for sl-eval only; no earlier step sees it. No length is known, so the scale is free.
-$(IMAGES)/report.html: $(IMAGES)/refined/training.json
-	rm -rf $(IMAGES)/scan/ground_truth
-	cp -r $(IMAGES)/captures/ground_truth $(IMAGES)/scan/ground_truth
-	$(BIN)/sl-eval --mesh $(IMAGES)/mesh.ply --data $(IMAGES)/scan --poses $(IMAGES)/refined/transforms.json \
-	  --json $(IMAGES)/evaluation.json --report $@
+# No earlier step sees the truth. No length is known, so the scale is free.
+$(IMAGES)/truth.html: $(IMAGES)/result/report.html
+	$(BIN)/sl-eval --mesh $(IMAGES)/result/mesh.ply --data $(IMAGES)/result/scan \
+	  --poses $(IMAGES)/result/poses/transforms.json --reference $(IMAGES)/captures/ground_truth/mesh.ply \
+	  --json $(IMAGES)/truth.json --report $@
 
 # On up to four cores. The tests of one file run together, because they share what was trained for them.
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --maxprocesses 4 --dist loadfile

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-COMMANDS = ("sl-synth", "sl-process", "ns-train", "sl-export", "sl-eval")
+STEPS = {"demo": ("sl-synth", "ns-train", "sl-export", "sl-eval"), "demo-images": ("sl-synth", "sl-scan", "sl-eval")}
+COMMANDS = sorted({name for steps in STEPS.values() for name in steps})
 
 # Writes the files of the real command, the last of them last; fails in the middle if it is named in the file `fail`.
 FAKE = r"""#!/bin/bash
@@ -21,7 +22,7 @@ case $name in
 sl-synth) put "${flag[output]}/ground_truth/mesh.ply"; fail
   if [ -v flag[images-only] ]; then last=intrinsics.json; else last=transforms.json; fi
   put "${flag[output]}/$last" ;;
-sl-process) fail; put "${flag[output]}/transforms.json" ;;
+sl-scan) put "${flag[output]}/mesh.ply"; fail; put "${flag[output]}/report.html" ;;
 ns-train)
   if [ -v flag[load-config] ]; then run=$(dirname "${flag[load-config]}")
   else run=${flag[output-dir]}/${flag[experiment-name]}/sl-neus/demo; put "$run/config.yml"; fi
@@ -53,13 +54,13 @@ def make(tmp_path):
     return run
 
 
-@pytest.mark.parametrize("target", ["demo", "demo-images"])
+@pytest.mark.parametrize("target", STEPS)
 def test_a_demo_goes_on_after_what_is_complete(make, target):
-    steps = [name for name in COMMANDS if target == "demo-images" or name != "sl-process"]
+    steps = STEPS[target]
     for k, name in enumerate(steps):
         status, calls = make(target, failing=name)
         assert status != 0
-        assert [call.split()[0] for call in calls] == ([name] if k == 0 else steps[k - 1 : k + 1])
+        assert [call.split()[0] for call in calls] == ([name] if k == 0 else list(steps[k - 1 : k + 1]))
         if k and steps[k - 1] == "ns-train":
             assert "--load-config" in calls[0]  # it had begun
     status, calls = make(target)
@@ -68,6 +69,6 @@ def test_a_demo_goes_on_after_what_is_complete(make, target):
 
 
 def test_without_an_interruption_every_command_is_called_once(make):
-    status, calls = make("demo-images")
-    assert status == 0 and [call.split()[0] for call in calls] == list(COMMANDS)
-    assert "--load-config" not in calls[2] and "--overwrite" in calls[3]
+    status, calls = make("demo")
+    assert status == 0 and [call.split()[0] for call in calls] == list(STEPS["demo"])
+    assert "--load-config" not in calls[1] and "--overwrite" in calls[2]

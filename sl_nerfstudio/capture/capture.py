@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -26,7 +27,8 @@ from sl_nerfstudio.decoding.decoder import Decoded, DecodingError
 from sl_nerfstudio.decoding.gray_code import decode_gray_code
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.gray_code import GrayCode
-from sl_nerfstudio.scan.images import as_grey, read_image
+from sl_nerfstudio.scan.images import as_grey, encode_png, read_image
+from sl_nerfstudio.storage import write_atomic
 
 # Capturing by hand: images of one static pattern are judged as they come, and kept where they add something.
 
@@ -110,6 +112,41 @@ def picture_of(image: UInt8[ndarray, "h w 3"], view: GridView) -> UInt8[ndarray,
     small, factor = reduced(image)
     radius = _RADIUS * view.period * factor if np.isfinite(view.period) else 1.0
     return draw_nodes(small, view.uv * np.float32(factor), radius)
+
+
+class WhiteLight:
+    """Photographs each frame that was kept once more, with the display white in place of the pattern.
+
+    For `kept` of `capture_by_hand`; the pictures have the names of the frames.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        frames: Path,
+        camera: Camera,
+        screen: Screen,
+        pattern: UInt8[ndarray, "h w"],
+        settle: float,
+        kept: Callable[[str, GridView], None],
+    ) -> None:
+        """`frames`: the folder of the captures. Raises UserError if `folder` holds pictures of other captures."""
+        others = [path.name for path in sorted(folder.glob("frame_*")) if not (frames / path.name).exists()]
+        if others:
+            raise UserError(
+                f"--color {folder}: holds {others[0]}, and there is no such frame in {frames}\n"
+                "    cause:  the pictures are those of other captures\n    remedy: give a new folder"
+            )
+        self._folder, self._camera, self._screen, self._kept = folder, camera, screen, kept
+        self._pattern, self._settle = pattern, settle
+
+    def __call__(self, name: str, view: GridView) -> None:
+        """Take the picture of the frame with this file name. Raises UserError if it cannot be written."""
+        self._screen.show(np.full_like(self._pattern, 255))
+        picture = self._camera.after(time.monotonic() + self._settle)[1]
+        self._screen.show(self._pattern)
+        write_atomic(self._folder / name, encode_png(picture))
+        self._kept(name, view)
 
 
 _CELLS = 48  # columns of the map of the pattern

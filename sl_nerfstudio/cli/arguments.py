@@ -35,7 +35,8 @@ def parse(kind: type[T], command: str, inputs: Mapping[str, str] | None = None, 
     import tyro
 
     found = tyro.cli(kind, prog=command, config=(tyro.conf.OmitArgPrefixes,))
-    require_paths({flag_name(name): (getattr(found, name), remedy) for name, remedy in (inputs or {}).items()})
+    names = {flag.field: flag.words.partition(" ")[0] for flag in flags_of(kind)}  # of positional ones, what they are
+    require_paths({names[name]: (getattr(found, name), remedy) for name, remedy in (inputs or {}).items()})
     return found
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from sl_nerfstudio.cli.arguments import parse, require_paths
 from sl_nerfstudio.cli.run import Terminated, run
+from sl_nerfstudio.console import command, next_steps
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -57,7 +58,10 @@ class CaptureConfig:
     rate: float = 4.0
     """images per second that are decoded at most; of a video, per second of its time"""
     settle: float = 0.25
-    """seconds that each image of a Gray-code sequence is shown before it is captured"""
+    """seconds that each image of a Gray-code sequence, and the light of --color, is shown before it is captured"""
+    color: Path | None = None
+    """folder for a picture of each kept frame in white light instead of the pattern, for the colours of the mesh; with
+    --show, for a coded grid: hold still until it is taken (Gray code has such images)"""
     frames: int | None = None
     """end when the folder holds so many frames; default: when Escape is pressed or the video ends"""
     headless: bool = False
@@ -73,6 +77,13 @@ class CaptureConfig:
             raise UserError(f"--frames {self.frames}: give a number of at least 1")
         if self.show is not None and self.pattern is None:
             raise UserError(f"--show {self.show}: give --pattern, which says what is to be shown")
+        if self.color is not None and (self.show is None or not self.camera.isdigit()):
+            raise UserError(
+                f"--color {self.color}: needs a camera, and a display that shows the pattern\n"
+                "    cause:  --show is missing, or --camera is a video: nothing else can be shown instead\n"
+                "    remedy: give --show; or photograph the colours yourself, from the same places, for --color of "
+                "sl-process"
+            )
         if self.headless and self.pattern is None:
             raise UserError(
                 "--headless: without a pattern, frames are kept by key alone, and there is no window to press it in\n"
@@ -88,7 +99,7 @@ class CaptureConfig:
 
 
 _GROUPS = {
-    "the pattern": ("pattern", "show", "settle"),
+    "the pattern": ("pattern", "show", "settle", "color"),
     "the camera": ("size", "exposure", "focus", "rate"),
     "this run": ("frames", "headless"),
 }
@@ -234,10 +245,10 @@ def capture(config: CaptureConfig) -> None:
 
 
 def _single_images(config: CaptureConfig, source: "Camera | Video", layout: "GridPattern | None") -> None:
-    from sl_nerfstudio.capture.camera import CaptureFolder
-    from sl_nerfstudio.capture.capture import Reader, capture_by_hand, resume
+    from sl_nerfstudio.capture.camera import Camera, CaptureFolder
+    from sl_nerfstudio.capture.capture import Reader, WhiteLight, capture_by_hand, resume
     from sl_nerfstudio.capture.screen import pattern_picture
-    from sl_nerfstudio.capture.selection import GridReader, PlainReader, Selection
+    from sl_nerfstudio.capture.selection import GridReader, GridView, PlainReader, Selection
 
     picture = None
     if config.show is not None and config.pattern is not None and layout is not None:
@@ -249,7 +260,9 @@ def _single_images(config: CaptureConfig, source: "Camera | Video", layout: "Gri
             screen.show(picture)
         resume(folder, reader, selection)
         say(f"{_described(source)}; {'control-C ends' if config.headless else 'Space keeps an image, Escape ends'}")
-        kept = partial(kept_words, say, selection)
+        kept: Callable[[str, GridView], None] = partial(kept_words, say, selection)
+        if config.color is not None and picture is not None and screen is not None and isinstance(source, Camera):
+            kept = WhiteLight(config.color, config.output, source, screen, picture, config.settle, kept)
         with _ended_by_control_c():
             capture_by_hand(source, reader, selection, folder, watcher, view_lines, kept, config.rate, config.frames)
         say(coverage_words(len(selection.kept), config.output, selection.times_seen))
@@ -269,6 +282,11 @@ def _sequences(config: CaptureConfig, source: "Camera | Video", layout: "GrayCod
         raise UserError(
             f"--camera {source.name}: Gray code cannot be captured from a video\n"
             "    cause:  each image must be grabbed while the display shows it\n    remedy: give the number of a camera"
+        )
+    if config.color is not None:
+        raise UserError(
+            f"--color {config.color}: Gray code has its own images in white light, which give the colours\n"
+            "    remedy: leave --color out"
         )
     if config.show is None:
         raise UserError(
@@ -332,8 +350,9 @@ def _next_command(config: CaptureConfig) -> str:
         board = '--board chessboard --corners 9x6 --square "18 mm"'
         words = "next, for images of a board (with its own numbers):"
         return f"{words}\n    sl-calibrate {images} {board} --camera-only --output intrinsics.json"
-    pattern = f"--pattern {shlex.quote(str(config.pattern))}"
-    return f"next:\n    sl-process {images} {pattern} --intrinsics intrinsics.json --output scan"
+    words = ["sl-scan", config.output, "--pattern", config.pattern, "--intrinsics", "intrinsics.json"]
+    color = () if config.color is None else ("--color", config.color)
+    return next_steps([command(*words, *color, "--output", "result")])
 
 
 def main() -> None:

@@ -246,10 +246,16 @@ def require_other_files(paths: tuple[Path, ...], scan: Path) -> None:
 
 _SUSPICIOUS_PX = 3.0
 _LONG_SECONDS = 15.0
+_SAME_EXPOSURE = 1.02
 
 
 def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
     """The whole text."""
+    return "\n".join([description(config, scan, exported), *_next(config, scan, exported)])
+
+
+def description(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
+    """What was written, removed and invented, without what to do next."""
     unit = unit_word(scan.units)
     mesh, surface = exported.mesh, exported.surface
     extent = " x ".join(f"{side:.4g}" for side in mesh.vertices.max(0) - mesh.vertices.min(0))
@@ -262,12 +268,12 @@ def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
         *_pieces(config, surface),
         *_invented(config, exported),
         *_decimated(exported, unit),
-        *(_colours(exported) if exported.textured is None else _texture_words(exported.textured, unit)),
+        *(_colours(exported) if exported.textured is None else _texture_words(exported, exported.textured, unit)),
         *_uncertainty(exported.properties.quality, unit),
         *_other_files(config, scan, exported, unit),
     ]
     lines.append(f"time: surface {surface.extraction_seconds:.1f} s, everything else {exported.writing_seconds:.1f} s")
-    return "\n".join([fitted("\n".join(lines)), *_next(config, scan, exported)])
+    return fitted("\n".join(lines))
 
 
 def _next(config: ExportConfig, scan: "Scan", exported: "Exported") -> list[str]:
@@ -409,15 +415,29 @@ def _colours(exported: "Exported") -> list[str]:
     if colours is None:
         return []
     grey = f"; {1 - colours.seen.mean():.1%} of the vertices are in none of them and grey" * (not colours.seen.all())
-    return [f"  colours from {colours.pictures} pictures without the pattern{grey}"]
+    return [f"  colours from {_pictures(exported)}{grey}"]
 
 
-def _texture_words(textured: "Textured", unit: str) -> list[str]:
+def _pictures(exported: "Exported") -> str:
+    """How many there are, and how much their exposures differ."""
+    pictures = exported.pictures
+    if pictures is None:
+        return "no pictures"
+    least, most = pictures.gains.min(), pictures.gains.max()
+    differ = (
+        f" (exposures from {least:.2f} to {most:.2f} of their mean, evened out)"
+        if most > _SAME_EXPOSURE * least
+        else ""
+    )
+    return f"{len(pictures)} pictures without the pattern{differ}"
+
+
+def _texture_words(exported: "Exported", textured: "Textured", unit: str) -> list[str]:
     side, charts = len(textured.texture.image), textured.texture.charts.count
     unseen = f"; {_percent(1 - textured.seen)} of the surface is in none of them and grey" * (textured.seen < 1)
     lines = [
         f"  texture of {side} x {side} pixels, {textured.texel:.2g} {unit} each, in {charts:,} charts, from "
-        f"{textured.pictures} pictures without the pattern{unseen}"
+        f"{_pictures(exported)}{unseen}"
     ]
     if textured.layout_seconds > _LONG_SECONDS:
         lines.append(f"    laying the mesh out flat took {textured.layout_seconds:.0f} s; fewer triangles "
@@ -493,17 +513,17 @@ def export(config: ExportConfig) -> None:
         with phase("load"):
             trained = load_run(config.load_config, config.data)
         with phase("export"):
-            said = export_trained(trained, config)
-    print(said)
+            exported = export_trained(trained, config)
+    print(summary(config, trained.model.scan, exported))
 
 
-def export_trained(trained: "TrainedRun", config: ExportConfig) -> str:
-    """Export a loaded run; returns the summary to print."""
+def export_trained(trained: "TrainedRun", config: ExportConfig) -> "Exported":
+    """Export a loaded run. Raises UserError for anything a user can correct."""
     from sl_nerfstudio.runs.export import export_run
 
     scan = trained.model.scan
     require_other_files(config.pose_files, scan.root)
-    return summary(config, scan, export_run(trained, config.settings(scan.units)))
+    return export_run(trained, config.settings(scan.units))
 
 
 if __name__ == "__main__":

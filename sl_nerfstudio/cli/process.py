@@ -1,6 +1,5 @@
 """sl-process: from photographs to a scan folder."""
 
-import sys
 from typing import TYPE_CHECKING
 
 from sl_nerfstudio.cli.arguments import parse
@@ -18,13 +17,14 @@ _INPUTS = {
     "intrinsics": "give the file with the intrinsics; sl-calibrate makes one",
     "projector_intrinsics": "give the file with the intrinsics; sl-calibrate makes one",
     "masks": "give the folder with one mask for each frame",
+    "color": "give the folder with the photographs without the pattern",
     "poses": "give a transforms.json with rough poses",
 }
 _GROUPS = {
     "devices": ("intrinsics", "projector_intrinsics", "projector_model", "procam_step", "rig", "estimate_projector"),
     "captures": ("decoder", "sequence", "cell", "unordered", "not_mosaic"),
     "lengths and poses": ("known_length", "poses", "no_adjust"),
-    "what is used of the pictures": ("masks", "object_only"),
+    "what is used of the pictures": ("masks", "object_only", "color"),
     "this run": ("work", "jobs", "seed"),
 }
 
@@ -35,18 +35,28 @@ def main() -> None:
 
 
 def _process() -> None:
-    config = parse(ProcessConfig, "sl-process", _INPUTS, _GROUPS)
+    result = process_photographs(parse(ProcessConfig, "sl-process", _INPUTS, _GROUPS))
+    kept = (
+        f"decoded frames and poses are kept in {result.config.work_folder}: the same command with another length,\n"
+        "    other flags or another output takes them from there; remove this folder once you are happy with the scan"
+    )
+    print(
+        findings(result), kept, next_steps([command("ns-train", "sl-neus", "--data", result.config.output)]), sep="\n"
+    )
+
+
+def process_photographs(config: ProcessConfig) -> "ProcessResult":
+    """Make the scan folder with its report. Raises UserError for anything a user can correct."""
     config.check()
     with phase("start"):
         from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
         from sl_nerfstudio.processing.process import process
 
-    result = process(config, render_processing_report, say)
-    sys.stdout.write(closing_words(result))
+    return process(config, render_processing_report, say)
 
 
-def closing_words(result: "ProcessResult") -> str:
-    """The summary at the end of the output."""
+def findings(result: "ProcessResult", what: str = "") -> str:
+    """The verdict (on `what`), the frames that were left out, and where the report is."""
     from sl_nerfstudio.processing.result import first_line
 
     output = result.config.output
@@ -60,12 +70,9 @@ def closing_words(result: "ProcessResult") -> str:
             "    (as you measure it) adds one in seconds"
         )
     return (
-        f"verdict: {result.verdict.band}\n{reasons}"
+        f"verdict{what}: {result.verdict.band}\n{reasons}"
         f"wrote {result.registered} of {len(result.frames)} frames to {output}, {scale}\n{''.join(lost)}"
-        f"report: {output / 'processing.html'}\n"
-        f"decoded frames and poses are kept in {result.config.work_folder}: the same command with another length,\n"
-        "    other flags or another output takes them from there; remove this folder once you are happy with the scan\n"
-        f"{next_steps([command('ns-train', 'sl-neus', '--data', output)])}\n"
+        f"report: {output / 'processing.html'}"
     )
 
 

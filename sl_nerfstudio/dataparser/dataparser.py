@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+import tyro
 from jaxtyping import Bool, Float, Float16, Float32, Int, Int16, Int32, Int64, Shaped, UInt8, UInt64
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.dataparsers.base_dataparser import DataParser, DataParserConfig, DataparserOutputs
@@ -437,6 +438,9 @@ class SLDataParserConfig(DataParserConfig):
     """Shrink whole images by this factor in evaluation, rendering and the viewer. Training uses every pixel."""
     intrinsics_change: IntrinsicsChange = UNCHANGED
     """Change of the scan's focal lengths and principal points; `refine_intrinsics` sets it."""
+    length_factor: tyro.conf.Suppress[float] = 1.0
+    """What the scan's lengths are multiplied by, so that a length that it got after the training holds at the poses of
+    the run."""
 
 
 @dataclass(frozen=True)
@@ -479,7 +483,7 @@ class SLDataParser(DataParser):
                 f"    remedy: put it back, or a link to it: ln -s NEW-PLACE {shlex.quote(str(root))}; sl-eval and "
                 "sl-export have --data for its new place"
             )
-        return load_scan(root, self.config.intrinsics_change)
+        return load_scan(root, self.config.intrinsics_change, self.config.length_factor)
 
     def _generate_dataparser_outputs(self, split: str = "train", **kwargs: dict | None) -> DataparserOutputs:
         scan, S = self.loaded.scan, self.loaded.S_scene_world
@@ -526,14 +530,15 @@ def scan_root(data: Path) -> Path:
     return data.parent if data.name == "transforms.json" else data
 
 
-_remembered: dict[tuple[Path, int], dict[IntrinsicsChange, LoadedScan]] = {}
+_remembered: dict[tuple[Path, int], dict[tuple[IntrinsicsChange, float], LoadedScan]] = {}
+_AS_IT_IS = (UNCHANGED, 1.0)
 
 
-def load_scan(data: Path, intrinsics_change: IntrinsicsChange = UNCHANGED) -> LoadedScan:
+def load_scan(data: Path, intrinsics_change: IntrinsicsChange = UNCHANGED, length_factor: float = 1.0) -> LoadedScan:
     """Read a scan with all of its pixels. The last one is cached while its transforms.json is unchanged.
 
     nerfstudio makes several dataparsers in one command; the pixels are read once. Raises UserError for a folder that
-    cannot be used, or for a change that leads to impossible intrinsics.
+    cannot be used, or for a change that leads to impossible intrinsics. The scene does not depend on `length_factor`.
     """
     root = scan_root(data)
     scan = read_scan(root)
@@ -541,14 +546,14 @@ def load_scan(data: Path, intrinsics_change: IntrinsicsChange = UNCHANGED) -> Lo
     if key not in _remembered:
         _remembered.clear()
         samples = build_samples(scan)
-        _remembered[key] = {UNCHANGED: LoadedScan(scan, samples, normalisation(scan, samples))}
-    loaded = _remembered[key]
-    if intrinsics_change not in loaded:
-        changed = scan.with_intrinsics_change(intrinsics_change)
+        _remembered[key] = {_AS_IT_IS: LoadedScan(scan, samples, normalisation(scan, samples))}
+    loaded, wanted = _remembered[key], (intrinsics_change, length_factor)
+    if wanted not in loaded:
+        changed = scan.with_intrinsics_change(intrinsics_change) if intrinsics_change else scan
         _require_possible(changed)
-        samples = loaded[UNCHANGED].samples
-        loaded[intrinsics_change] = LoadedScan(changed, samples, normalisation(changed, samples))
-    return loaded[intrinsics_change]
+        changed, samples = changed.scaled(length_factor), loaded[_AS_IT_IS].samples
+        loaded[wanted] = LoadedScan(changed, samples, normalisation(changed, samples))
+    return loaded[wanted]
 
 
 def _require_possible(scan: Scan) -> None:

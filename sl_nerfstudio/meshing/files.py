@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64, UInt8, UInt16
+from jaxtyping import Float64, UInt8, UInt16
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError, first_line
 from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.meshing.mesh import GREY, Charts, Mesh, Texture, VertexProperties, VertexQuality
+from sl_nerfstudio.meshing.mesh import GREY, Charts, Mesh, Texture, VertexProperties, VertexQuality, as_linear
 from sl_nerfstudio.scan.document import FileError, check_file
 from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.scan.types import UNITS
@@ -284,9 +284,7 @@ def _views(parts: list[bytes], targets: list[int | None]) -> list[dict[str, int]
 
 def _linear(colour: UInt8[ndarray, "*n"]) -> UInt16[ndarray, "*n"]:
     """sRGB as linear light with 16 bits: colours of vertices are linear in glTF."""
-    value: Float[ndarray, "*n"] = colour / 255.0
-    light = np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-    return np.round(light * 65535).astype("<u2")
+    return np.round(as_linear(colour / 255.0) * 65535).astype("<u2")
 
 
 def _container(document: dict[str, Any], binary: bytes) -> bytes:

@@ -111,6 +111,17 @@ GREY = 128
 """Colour of vertices that no capture shows."""
 
 
+def as_linear(rgb: Float[ndarray, "*n"]) -> Float64[ndarray, "*n"]:
+    """sRGB in [0, 1] as linear light."""
+    return np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+
+
+def as_srgb(light: Float64[ndarray, "*n"]) -> Float64[ndarray, "*n"]:
+    """Linear light as sRGB in [0, 1]."""
+    light = np.clip(light, 0.0, 1.0)
+    return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
 @dataclass(frozen=True)
 class VertexProperties:
     """Properties of every vertex of a mesh."""

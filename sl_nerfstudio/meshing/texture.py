@@ -1,6 +1,7 @@
 """Colours of a surface, of its vertices or as a texture, from captures that were also taken without the pattern."""
 
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,9 +13,10 @@ from scipy.ndimage import map_coordinates
 
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.geometry.numerics import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import world_pixels
 from sl_nerfstudio.meshing.finish import ClosestSurface
-from sl_nerfstudio.meshing.mesh import GREY, Charts, Mesh, Texture
+from sl_nerfstudio.meshing.mesh import GREY, Charts, Mesh, Texture, as_linear, as_srgb
 from sl_nerfstudio.meshing.visibility import Occluder
 from sl_nerfstudio.parallel import compiled, results, threads
 from sl_nerfstudio.scan.types import Frame, Scan
@@ -29,46 +31,102 @@ class Colours:
 
     rgb: UInt8[ndarray, "n 3"]  # sRGB; GREY where no picture shows the point
     seen: Bool[ndarray, "n"]  # by at least one picture
-    pictures: int
 
 
-def vertex_colours(mesh: Mesh, scan: Scan, poses: DevicePoses) -> Colours | None:
-    """Colours of all vertices; None if no frame of the scan has a picture (`sl_color_path`)."""
-    if not has_pictures(scan):
-        return None
-    return point_colours(mesh.vertices, mesh.vertex_normals(), Occluder(mesh), scan, poses)
+class Pictures:
+    """The captures without the pattern at their poses, with their exposures evened out.
+
+    A picture sees a point of a mesh that faces its camera, is inside the image, and that the mesh hides not; a picture
+    that is the capture itself (of Gray code, in full light) only what the projector lights. What several pictures see
+    tells how much brighter each is than the others, in red, green and blue: its `gains`, of linear light, by which its
+    colours are divided. Their geometric mean is 1.
+    """
+
+    gains: Float64[ndarray, "pictures 3"]
+
+    def __init__(self, mesh: Mesh, scan: Scan, poses: DevicePoses) -> None:
+        """Raises ValueError for a scan without pictures."""
+        self._occluder, self.task = Occluder(mesh), "colours of the surface"
+        self._frames = [(frame, poses.T_world_camera[k]) for k, frame in enumerate(scan.frames) if frame.color_path]
+        if not self._frames:
+            raise ValueError(f"{scan.root} has no picture without the pattern")
+        self.gains = np.ones((len(self._frames), 3))
+        some = evenly_spaced(len(mesh.vertices), min(len(mesh.vertices), _COMPARED))
+        if len(self._frames) > 1:
+            self.gains = self._compared(mesh.vertices[some], mesh.vertex_normals()[some])
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._frames)
+
+    def exposures(self) -> dict[str, list[float]]:
+        """The gains by the names of the frames."""
+        return {frame.name: gain.tolist() for (frame, _), gain in zip(self._frames, self.gains, strict=True)}
+
+    def colours(self, points: Float64[ndarray, "n 3"], normals: Float64[ndarray, "n 3"]) -> Colours:
+        """The mean of linear light over all pictures that see a point, weighted by the squared cosine of the angle.
+
+        This is the angle between the normal and the line of sight. Saturated pixels count where nothing else shows the
+        point. As many pictures are in memory at a time as there are threads.
+        """
+        total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
+        for gain, (index, square, light) in zip(self.gains, self._looks(points, normals), strict=True):
+            square = np.where(light.max(1) < _SATURATED, square, _HARDLY * square)
+            total[index] += square[:, None] * light / gain
+            weight[index] += square
+        seen = weight > 0
+        rgb = as_srgb(total / np.where(seen, weight, 1.0)[:, None])
+        return Colours(np.where(seen[:, None], np.round(255 * rgb), GREY).astype(np.uint8), seen)
+
+    def _compared(self, points: Float64[ndarray, "n 3"], normals: Float64[ndarray, "n 3"]) -> Float64[ndarray, "k 3"]:
+        light = np.full((len(self._frames), len(points), 3), np.nan)
+        square = np.zeros((len(self._frames), len(points)))
+        for k, (index, weights, seen) in enumerate(self._looks(points, normals)):
+            usable = (seen > _DARK).all(1) & (seen < _SATURATED).all(1)
+            light[k, index[usable]], square[k, index[usable]] = np.log(seen[usable]), weights[usable]
+        return np.exp(np.stack([relative_levels(light[..., c], square) for c in range(3)], 1))
+
+    def _looks(
+        self, points: Float64[ndarray, "n 3"], normals: Float64[ndarray, "n 3"]
+    ) -> Iterator[tuple[Int64[ndarray, "m"], Float64[ndarray, "m"], Float64[ndarray, "m 3"]]]:
+        """What each picture sees: see `_look`."""
+        for first in track(range(0, len(self._frames), threads()), self.task):
+            some = self._frames[first : first + threads()]
+            yield from results([partial(_look, points, normals, self._occluder, *one) for one in some])
+
+
+_COMPARED = 20_000  # vertices that tell the exposures
+_DARK, _SATURATED = 0.01, 0.97  # of linear light at full scale: beyond, a pixel does not tell how bright it was
+_HARDLY = 1e-3
+_ROUNDS, _DOUBTFUL = 20, 0.1  # of the robust fit; a difference of the logarithms, as shadows and reflections make
+
+
+def relative_levels(
+    values: Float64[ndarray, "pictures points"], weights: Float64[ndarray, "pictures points"]
+) -> Float64[ndarray, "pictures"]:
+    """Levels x such that x + y explains the values best, with a y for each point; their mean is 0.
+
+    Values with weight 0 are not looked at. Those that differ much from what the others say count less (Cauchy).
+    Pictures that share no point with the others, by any way, are compared among themselves alone.
+    """
+    several = (weights > 0).sum(0) > 1
+    values, weights = np.where(weights > 0, values, 0.0)[:, several], weights[:, several]
+    level, robust = np.zeros(len(values)), weights
+    for _ in range(_ROUNDS):
+        total = np.maximum(robust.sum(0), 1e-300)
+        of_points = (robust * (values - level[:, None])).sum(0) / total
+        off = values - level[:, None] - of_points
+        robust = weights / (1 + (off / _DOUBTFUL) ** 2)
+        total = np.maximum(robust.sum(0), 1e-300)
+        H = np.diag(robust.sum(1)) - (robust / total) @ robust.T  # the points' unknowns are eliminated
+        g = (robust * (values - (robust * values).sum(0) / total)).sum(1)
+        level = np.linalg.lstsq(H, g, rcond=1e-9)[0]
+    return level - level.mean() if len(level) else level
 
 
 def has_pictures(scan: Scan) -> bool:
     """Whether some frame was also captured without the pattern."""
     return any(frame.color_path is not None for frame in scan.frames)
-
-
-def point_colours(
-    points: Float64[ndarray, "n 3"],
-    normals: Float64[ndarray, "n 3"],
-    occluder: Occluder,
-    scan: Scan,
-    poses: DevicePoses,
-    task: str = "colours of the surface",
-) -> Colours:
-    """The mean over all pictures that see a point, weighted by the squared cosine of the viewing angle.
-
-    A picture sees a point of the occluder's mesh that faces its camera, is inside the image, and that the mesh hides
-    not. Exposure and white balance count as the same in all pictures. `task` names the progress. As many pictures are
-    in memory at a time as there are threads.
-    """
-    pictures = [(k, frame) for k, frame in enumerate(scan.frames) if frame.color_path is not None]
-    total, weight = np.zeros((len(points), 3)), np.zeros(len(points))
-    for first in track(range(0, len(pictures), threads()), task):
-        some = pictures[first : first + threads()]
-        looks = [partial(_look, points, normals, occluder, frame, poses.T_world_camera[k]) for k, frame in some]
-        for index, square, rgb in results(looks):
-            total[index] += square[:, None] * rgb
-            weight[index] += square
-    seen = weight > 0
-    rgb = np.where(seen[:, None], total / np.where(seen, weight, 1.0)[:, None] * 255, GREY)
-    return Colours(np.round(rgb).clip(0, 255).astype(np.uint8), seen, len(pictures))
 
 
 def _look(
@@ -78,7 +136,7 @@ def _look(
     frame: Frame,
     T_world_camera: Float64[ndarray, "4 4"],
 ) -> tuple[Int64[ndarray, "m"], Float64[ndarray, "m"], Float64[ndarray, "m 3"]]:
-    """Points that a picture sees, squared cosines between their normals and lines of sight, and colours in [0, 1]."""
+    """Points that a picture sees, squared cosines between their normals and lines of sight, and their linear light."""
     eye = T_world_camera[:3, 3]
     way = eye - points
     cosine = np.einsum("vi,vi->v", way, normals) / np.linalg.norm(way, axis=1)
@@ -86,7 +144,12 @@ def _look(
     uv, inside = world_pixels(frame.camera, T_world_camera, points[index])
     index, uv = index[inside], uv[inside]
     free = ~occluder.hidden(points, normals, index, eye)
-    return index[free], cosine[index[free]] ** 2, _look_up(frame, uv[free])
+    index, uv = index[free], uv[free]
+    if frame.color_path == frame.image_path:
+        column, row = np.floor(uv).astype(np.int64).T
+        lit = frame.read_mask()[row, column]
+        index, uv = index[lit], uv[lit]
+    return index, cosine[index] ** 2, as_linear(_look_up(frame, uv))
 
 
 def _look_up(frame: Frame, uv: Float64[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
@@ -220,12 +283,11 @@ class Textured:
     texture: Texture
     texel: float  # side of a pixel on the surface, on average
     seen: float  # share of the surface's pixels that some picture shows; the others are grey
-    pictures: int
     layout_seconds: float
 
 
-def surface_texture(mesh: Mesh, size: int, whole: Mesh, scan: Scan, poses: DevicePoses) -> Textured:
-    """A texture of size x size pixels for `mesh`, coloured as vertices are: see `point_colours`.
+def surface_texture(mesh: Mesh, size: int, whole: Mesh, pictures: Pictures) -> Textured:
+    """A texture of size x size pixels for `mesh`, coloured as vertices are: see `Pictures.colours`.
 
     `whole` is the mesh before it was decimated, or the same one: each pixel has the colour of the closest point there.
     Pixels up to two beside a chart have the colour of its edge, all others that of the nearest pixel, so that neither
@@ -238,16 +300,16 @@ def surface_texture(mesh: Mesh, size: int, whole: Mesh, scan: Scan, poses: Devic
     triangle, weights = draw_triangles(uv, size)
     texels = np.flatnonzero(triangle >= 0)
     image = np.full((size * size, 3), GREY, dtype=np.uint8)
-    surface, occluder, seen, pictures = _Surface(mesh, whole), Occluder(whole), 0, 0
+    surface, seen, pictures.task = _Surface(mesh, whole), 0, "colours of the texture"
     for first in range(0, len(texels), _AT_A_TIME):
         some = texels[first : first + _AT_A_TIME]
         points, normals = surface.at(triangle.reshape(-1)[some], weights.reshape(-1, 3)[some])
-        colours = point_colours(points, normals, occluder, scan, poses, "colours of the texture")
+        colours = pictures.colours(points, normals)
         image[some] = colours.rgb
-        seen, pictures = seen + int(colours.seen.sum()), colours.pictures
+        seen += int(colours.seen.sum())
     filled = _filled(image.reshape(size, size, 3), triangle >= 0)
     texel = (float(mesh.face_areas().sum()) / max(_area(uv), 1e-300)) ** 0.5 / size
-    return Textured(Texture(charts, filled), texel, seen / max(len(texels), 1), pictures, seconds)
+    return Textured(Texture(charts, filled), texel, seen / max(len(texels), 1), seconds)
 
 
 class _Surface:

@@ -29,7 +29,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.meshing.texture import MANY_CHARTS, draw_triangles, laid_out
 from sl_nerfstudio.model.loop import SLTrainer
 from sl_nerfstudio.model.model import SLModel
-from sl_nerfstudio.model.run_files import INTERRUPTION, SCAN_KEY, SETTINGS_KEY, as_tensor, as_text
+from sl_nerfstudio.model.run_files import INTERRUPTION, SCAN_KEY, SETTINGS_KEY, as_tensor, as_text, whole_command
 from sl_nerfstudio.model.viewer import SceneView
 from sl_nerfstudio.parallel import compiled_range, torch_on_one_thread
 
@@ -243,7 +243,7 @@ class SLPipeline(VanillaPipeline):
         self.scene_view.update()
 
     def _say_what_next(self, step: int, trainer: Any) -> None:
-        if comms.is_main_process():
+        if comms.is_main_process() and not whole_command():
             decoded = self.datamanager.samples.decoded_share
             config = trainer.config.get_base_dir() / "config.yml"
             print(what_next(config, self.datamanager.get_datapath(), decoded), flush=True)

@@ -184,6 +184,23 @@ def _scale(scan: Scan, S_scene_world: Similarity, refine: RefinePoses, start: Ri
     return agreeing_scale(start, rig, prior)
 
 
+def at_known_length(
+    scan: Scan,
+    S_scene_world: Similarity,
+    refine: RefinePoses,
+    config: PriorConfig,
+    rig: Rig,
+    factor: Float[Tensor, "joint k"],
+) -> tuple[float, Float[Tensor, "joint k"]]:
+    """The factor that restores the scan's lengths in a rig that was adjusted before they were known.
+
+    And a factor of the covariance under which the known length does not err, instead of the one known before.
+    """
+    prior = pose_prior(scan, S_scene_world, config)
+    growth = _scale(scan, S_scene_world, refine, scene_rig(scan, S_scene_world), rig, prior)
+    return growth, with_known_length(factor, rig, known_length(scan, S_scene_world, refine, rig, prior))
+
+
 def known_length(
     scan: Scan, S_scene_world: Similarity, refine: RefinePoses, rig: Rig, prior: PosePrior
 ) -> Float[Tensor, "unknowns"]:

@@ -317,9 +317,27 @@ def require_unused(folder: Path, models: Path, method: str) -> None:
     )
 
 
+_part_of: list[str] = []
+
+
+@contextmanager
+def part_of(command: str) -> Iterator[None]:
+    """Trainings in the block are a part of `command`, which goes on with them, and itself says what is next."""
+    _part_of.append(command)
+    try:
+        yield
+    finally:
+        _part_of.pop()
+
+
+def whole_command() -> str:
+    """The command of which trainings of this process are a part; "" if of none."""
+    return _part_of[-1] if _part_of else ""
+
+
 def go_on_command(method: str, folder: Path) -> str:
     """The command that continues a run up to the length that it was started with."""
-    return f"ns-train {method} --load-config {shlex.quote(str(folder / CONFIG))}"
+    return whole_command() or f"ns-train {method} --load-config {shlex.quote(str(folder / CONFIG))}"
 
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)

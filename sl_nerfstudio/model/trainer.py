@@ -110,7 +110,7 @@ class SLTrainerConfig(TrainerConfig):
         model: SLModelConfig = pipeline.model  # type: ignore[assignment]
         if self.last_step is None or begun is not None:  # else config.yml holds what was found
             dataparser.intrinsics_change = _intrinsics_change(root, dataparser.intrinsics_change, begun, model)
-        load_scan(root, dataparser.intrinsics_change)  # cached; fails if no rays meet
+        load_scan(root, dataparser.intrinsics_change, dataparser.length_factor)  # cached; fails if no rays meet
         self.data = root
         pipeline.datamanager.data = root
         self.output_dir = self.output_dir.expanduser().absolute()

@@ -64,6 +64,9 @@ class ProcessConfig:
     object_only: bool = False
     """leave out the plane that the object stands on, walls, and what is not connected to the object; the report shows
     what was left out"""
+    color: Path | None = None
+    """folder with photographs without the pattern, each from the same place as the frame that it is named like: the
+    colours of the mesh; Gray code needs none, it has images in full light"""
     jobs: int | None = None
     """number of processes that decode frames; default: one for each core, as far as there is memory for
     them"""

@@ -106,7 +106,7 @@ def written_scan(config: ProcessConfig) -> WrittenScan | None:
     Raises UserError if any file in it has been added, changed or removed since.
     """
     root = config.output
-    record = _document(config.work_folder / _SCANS).get(os.path.realpath(root))
+    record = _document(config.work_folder / _SCANS).get(_place(config))
     if not isinstance(record, dict) or record.keys() != {"captures", "files"} or not root.is_dir():
         return None
     written, there = WrittenScan(**record), files_below(root)
@@ -133,6 +133,11 @@ def written_scan(config: ProcessConfig) -> WrittenScan | None:
 def note_scan(config: ProcessConfig, folder: NewFolder, captures: str) -> None:
     """Note what was written to the output, so that the next run of the same captures may renew it."""
     path = config.work_folder / _SCANS
-    scans = {root: scan for root, scan in _document(path).items() if os.path.isdir(root)}
-    scans[os.path.realpath(config.output)] = asdict(WrittenScan(captures, folder.digests))
+    scans = {place: scan for place, scan in _document(path).items() if os.path.isdir(config.work_folder / place)}
+    scans[_place(config)] = asdict(WrittenScan(captures, folder.digests))
     write_atomic(path, encode_json(scans))
+
+
+def _place(config: ProcessConfig) -> str:
+    """Where the output lies, seen from the work folder: both may be moved together."""
+    return os.path.relpath(os.path.realpath(config.output), os.path.realpath(config.work_folder))

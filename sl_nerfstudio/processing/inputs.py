@@ -38,6 +38,7 @@ from sl_nerfstudio.processing.captures import (
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
 from sl_nerfstudio.processing.frames import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_kept_cloud
 from sl_nerfstudio.processing.masks import find_masks
+from sl_nerfstudio.processing.pictures import find_pictures, picture_sentences
 from sl_nerfstudio.processing.records import LargeClouds
 from sl_nerfstudio.processing.video import VideoChoice, is_video, video_frames
 from sl_nerfstudio.registration.result import KnownLength, is_index, parse_known_length
@@ -422,6 +423,7 @@ class Inputs:
     given: GivenPoses | None  # in the order of the captures
     known: KnownLength | None  # its frames by name
     notes: CaptureNotes  # on the captures
+    pictures: dict[str, Path]  # without the pattern, by the frame's name
 
 
 def read_inputs(config: ProcessConfig) -> Inputs:
@@ -438,6 +440,8 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     projector, stated = read_projector(config, (layout.w, layout.h))
     sizes = {frame.name: captures.sizes[frame.camera] for frame in captures.frames}
     masks = None if config.masks is None else find_masks(config.masks, sizes)
+    pictures = {} if config.color is None else find_pictures(config.color, captures)
+    said = picture_sentences(pictures, captures) if pictures else ()
     doubt = StatedSigma(cameras.sigma, read_projector_sigma(config, (layout.w, layout.h)) if stated else CERTAIN)
     last_step = "decode" if config.finds_projector else "match" if cameras.start is None else "calibrate"
     devices = cameras.first, projector
@@ -448,7 +452,8 @@ def read_inputs(config: ProcessConfig) -> Inputs:
         stated,
         None if config.poses is None else read_given_poses(config.poses, names),
         None if known is None else frames_by_name(known, names),
-        captured.notes,
+        replace(captured.notes, sentences=(*captured.notes.sentences, *said)),
+        pictures,
     )
 
 

@@ -149,11 +149,17 @@ def write_scan(
     results: Sequence[FrameStageResult],
     poses: ScanPoses,
     result: ProcessResult,
+    pictures: dict[str, Path],
     make_report: Callable[[ProcessResult, Sequence[Preview]], str],
 ) -> None:
-    """Write all frames that are in the scan by `result`. Leaving the folder completes it."""
+    """Write all frames that are in the scan by `result`. Leaving the folder completes it.
+
+    `pictures` are those without the pattern, by the frame's name; if there are none, a sequence has its images in full
+    light.
+    """
     layout = job.decoder.layout
-    shown = layout.place(ShownImage("white")) or 0 if isinstance(layout, GrayCode) else 0
+    white = layout.place(ShownImage("white")) if isinstance(layout, GrayCode) else None
+    shown = white or 0
     row = {cloud.name: k for k, cloud in enumerate(clouds_of(results))}
     worker = FrameWorker(job)
     size = (job.projector.w, job.projector.h)
@@ -177,12 +183,15 @@ def write_scan(
                 continue
             decoded, k = worker.load(frame), row[frame.name]
             keep = np.ones_like(decoded.mask) if part is None else part == Part.OBJECT
+            picture = pictures.get(frame.name)
             writer.add_frame(
                 frame.name,
                 image=image,
                 coords=np.where(keep[..., None], cloud.coords, np.float32(np.nan)),
                 mask=decoded.mask & keep,
                 pattern=np.rint(255 * decoded.pattern * keep).astype(np.uint8),
+                color=None if picture is None else read_photograph(picture),
+                image_is_color=white is not None and not pictures,
                 camera=job.camera_of(frame.frame) if job.cameras else None,
                 T_world_camera=poses.adjusted.poses.T_world_camera[k],
                 T_world_projector=poses.adjusted.poses.T_world_projector[k],
@@ -292,7 +301,7 @@ def _write(
         parts,
         moving,
     )
-    write_scan(folder, frames.job, frames.results, poses, result, make_report)
+    write_scan(folder, frames.job, frames.results, poses, result, inputs.pictures, make_report)
     return result
 
 

@@ -2,6 +2,7 @@
 
 import io
 import platform
+import shlex
 import time
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
@@ -33,11 +34,11 @@ from sl_nerfstudio.meshing.finish import (
     hull_planes,
 )
 from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties
-from sl_nerfstudio.meshing.texture import Colours, Textured, has_pictures, surface_texture, vertex_colours
+from sl_nerfstudio.meshing.texture import Colours, Pictures, Textured, has_pictures, surface_texture
 from sl_nerfstudio.meshing.uncertainty import vertex_uncertainty
 from sl_nerfstudio.meshing.visibility import Trimmed, trim_to_observed
 from sl_nerfstudio.model.model import RECOMMENDED_STEPS
-from sl_nerfstudio.model.run_files import plain
+from sl_nerfstudio.model.run_files import plain, whole_command
 from sl_nerfstudio.object_separation.planes import DecodedFrame, PlaneFinding
 from sl_nerfstudio.object_separation.separate import PIXELS_PER_FRAME, Separation, separate
 from sl_nerfstudio.parallel import one_library_thread
@@ -131,11 +132,12 @@ _PACKAGES = ("sl-nerfstudio", "nerfstudio", "torch", "numpy", "scipy", "numba", 
 _SETTINGS = ("method_name", "max_num_iterations", "schedule_iterations", "mixed_precision", "machine", "optimizers")
 
 
-def training_record(run: TrainedRun, settings: ExportSettings) -> dict[str, Any]:
+def training_record(run: TrainedRun, settings: ExportSettings, pictures: Pictures | None = None) -> dict[str, Any]:
     """`settings` (nested), `versions` (of the export, by package), `curves` (lists by name, NaN as None), and others.
 
     `intrinsics` says how these were changed, and how well they agree with the captures; `commands` go on from here: to
-    `train` the run up to its recommended length, to `export` it with finer cells.
+    `train` the run up to its recommended length, to `export` it with finer cells. `exposures`: what the light of each
+    picture without the pattern was divided by, in red, green and blue.
     """
     return {
         "settings": {"step": run.step, **run_settings(run.config)},
@@ -151,11 +153,14 @@ def training_record(run: TrainedRun, settings: ExportSettings) -> dict[str, Any]
             "self_calibration": _self_calibration(run.model.self_calibration()),
         },
         "commands": _commands(run, settings),
+        "exposures": {} if pictures is None else pictures.exposures(),
     }
 
 
 def _commands(run: TrainedRun, settings: ExportSettings) -> dict[str, list[str]]:
-    """As words, with absolute paths."""
+    """As words, with absolute paths; where the run is a part of another command, the one that makes both better."""
+    if whole_command():
+        return dict.fromkeys(("train", "export"), shlex.split(whole_command()))
     config, method = run.config, run.config.method_name
     folder: Path = config.get_base_dir().absolute()
     steps = max(RECOMMENDED_STEPS.get(method, 0), getattr(config, "schedule_iterations", None) or 0) - run.step - 1
@@ -374,6 +379,7 @@ class Exported:
     surface: ExtractedSurface  # before it was decimated
     decimated: Decimated | None
     colours: Colours | None  # of the surface before it was decimated; None: no picture without the pattern
+    pictures: Pictures | None  # from which they are
     textured: Textured | None  # None: no texture was asked for
     points: int  # in the point cloud
     pose_sigma: Float[ndarray, "frames 4"] | None  # in the order of PoseSigma's fields; None: not estimated
@@ -400,7 +406,8 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     joint = model.joint_covariance()
     with phase("uncertainty of the vertices"):
         quality = vertex_uncertainty(mesh, scan, poses, joint, model.cell)
-    colours = vertex_colours(mesh, scan, poses)
+    pictures = Pictures(mesh, scan, poses) if has_pictures(scan) else None
+    colours = None if pictures is None else pictures.colours(mesh.vertices, mesh.vertex_normals())
     invented = quality.views == 0 if settings.keep_unobserved else surface.marked.invented
     properties = VertexProperties(quality, invented, None if colours is None else colours.rgb)
     points = 0
@@ -415,18 +422,18 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
         mesh, properties = decimated.mesh, properties.chosen(decimated.nearest).moved(decimated.distance)
     if settings.watertight:
         _require_closed(mesh, settings)
-    if settings.texture is not None:
+    if settings.texture is not None and pictures is not None:
         with phase("laying the mesh out flat"):
-            textured = surface_texture(mesh, settings.texture, whole, scan, poses)
+            textured = surface_texture(mesh, settings.texture, whole, pictures)
     write_mesh(settings.mesh, mesh, properties, scan.units, None if textured is None else textured.texture)
     if settings.pose_folder is not None:
         _write_poses(settings.pose_folder / TRANSFORMS, model)
         write_covariance(settings.pose_folder, scan, joint)
-        write_atomic(settings.pose_folder / "training.json", encode_json(training_record(run, settings)))
+        write_atomic(settings.pose_folder / "training.json", encode_json(training_record(run, settings, pictures)))
     seconds = time.perf_counter() - start - surface.extraction_seconds
     refined = poses_refined(model)
     return Exported(
-        mesh, properties, surface, decimated, colours, textured, points, model.pose_sigma(), refined, seconds
+        mesh, properties, surface, decimated, colours, pictures, textured, points, model.pose_sigma(), refined, seconds
     )
 
 
@@ -442,9 +449,8 @@ def _require_pictures(settings: ExportSettings, scan: Scan) -> None:
     raise UserError(
         f"--texture {settings.texture}: no frame of {scan.root} has a picture without the pattern\n"
         "    cause:  a texture needs colours, and captures under the pattern have none\n"
-        "    remedy: photograph frames once more from the same place in even light, without the pattern, name these\n"
-        '            pictures in transforms.json ("sl_color_path": "color/NAME.png" in the frame) and train again;\n'
-        "            or leave --texture out"
+        "    remedy: photograph frames once more from the same place in even light, without the pattern, and give\n"
+        "            these photographs, named like the frames, to sl-process (--color); or leave --texture out"
     )
 
 

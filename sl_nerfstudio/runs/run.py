@@ -278,7 +278,8 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
     root = _scan_folder(config, data)
     config.pipeline.datamanager.data = root
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    loaded = load_scan(root, config.pipeline.datamanager.dataparser.intrinsics_change)
+    parser = config.pipeline.datamanager.dataparser
+    loaded = load_scan(root, parser.intrinsics_change, parser.length_factor)
     require_together(config.pipeline, checkpoint.weights, root, loaded.fingerprint)
     pipeline: Any = SLPipeline(config.pipeline, device, test_mode="inference")
     _require_same_keys(checkpoint.path, checkpoint.weights, pipeline.state_dict())

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.errors import Fault, ScanError
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange, project, unproject
-from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 from sl_nerfstudio.geometry.triangulation import pixel_rays, triangulate
 from sl_nerfstudio.scan.document import TRANSFORMS, Faults, Fields, Problem
 from sl_nerfstudio.scan.images import MAX_PIXELS, as_grey, read_coords, read_image
@@ -199,6 +199,11 @@ class PoseSigma:
     relative_translation: float
     relative_rotation_deg: float
 
+    def scaled(self, factor: float) -> "PoseSigma":
+        """The same for a world that is `factor` times as large."""
+        lengths = factor * self.camera_translation, factor * self.relative_translation
+        return replace(self, camera_translation=lengths[0], relative_translation=lengths[1])
+
 
 @dataclass(frozen=True)
 class Frame:
@@ -281,6 +286,15 @@ class Scan:
             frames=tuple(replace(frame, camera=change.camera.applied(frame.camera)) for frame in self.frames),
             intrinsics_change=change,
         )
+
+    def scaled(self, factor: float) -> "Scan":
+        """The scan with all lengths of its poses and of their uncertainty multiplied by a factor."""
+        grown, frames = Similarity.scaling(factor), []
+        for frame in self.frames:
+            poses = grown.poses(frame.T_world_camera), grown.poses(frame.T_world_projector)
+            sigma = None if frame.pose_sigma is None else frame.pose_sigma.scaled(factor)
+            frames.append(replace(frame, T_world_camera=poses[0], T_world_projector=poses[1], pose_sigma=sigma))
+        return replace(self, frames=tuple(frames))
 
     def read_pattern(self) -> Float32[ndarray, "h w"]:
         """The projected pattern in [0, 1]."""

@@ -129,6 +129,7 @@ class ScanWriter:
         pattern: UInt8[ndarray, "_ _"] | UInt16[ndarray, "_ _"] | None = None,
         mask: Bool[ndarray, "_ _"] | None = None,
         color: UInt8[ndarray, "_ _ *channels"] | UInt16[ndarray, "_ _ *channels"] | None = None,
+        image_is_color: bool = False,
         camera: Device | None = None,
         pose_sigma: PoseSigma | None = None,
         true_poses: tuple[Float[ndarray, "4 4"], Float[ndarray, "4 4"]] | None = None,
@@ -137,9 +138,9 @@ class ScanWriter:
         """Write one frame. `name` becomes the stem of its files; `true_poses` (camera, projector) go to ground_truth/.
 
         `coords` is None only for captures that have not been decoded yet: such a folder does not pass the check.
-        `color` is the same view without the pattern. `camera` replaces the common intrinsics; `extra` holds further
-        keys of the frame. Raises ValueError for a name given twice, shapes that differ from the camera's, or a pose
-        that is not a rigid motion.
+        `color` is the same view without the pattern; `image_is_color`: the image itself shows no pattern. `camera`
+        replaces the common intrinsics; `extra` holds further keys of the frame. Raises ValueError for a name given
+        twice, shapes that differ from the camera's, or a pose that is not a rigid motion.
         """
         device = camera or self._camera
         if device is None:
@@ -163,6 +164,8 @@ class ScanWriter:
             frame["mask_path"] = self._write(f"masks/{name}.png", encode_png(mask.astype(np.uint8) * np.uint8(255)))
         if color is not None:
             frame["sl_color_path"] = self._write(f"color/{name}.png", encode_png(color))
+        elif image_is_color:
+            frame["sl_color_path"] = frame["file_path"]
         if camera is not None:
             frame.update(device_fields(camera, "camera_model"))
         frame.update(pose_fields(T_world_camera, T_world_projector))

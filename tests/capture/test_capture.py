@@ -95,8 +95,8 @@ def test_a_video_gives_one_frame_of_each_place(command, video, pattern, tmp_path
     for words in ("this view is known", "blurred: move more slowly", "too bright", "too dark"):
         assert words in said
     assert "kept frame_0000.png" in said and "3 frames in" in said and "a scan usually takes 10 frames" in said
-    words = shlex.split(said.strip().splitlines()[-1])
-    assert words[:5] == ["sl-process", "--images", str(out), "--pattern", str(pattern)]
+    words = shlex.split(said.partition("next:\n")[2].replace("\\\n", " "))
+    assert words[:4] == ["sl-scan", str(out), "--pattern", str(pattern)]
 
 
 def test_a_folder_is_continued_and_nothing_is_kept_twice(command, video, pattern, tmp_path, capsys):
@@ -173,6 +173,29 @@ def test_the_grid_can_be_shown_by_the_same_command(command, keyboard, video, pat
     assert np.array_equal(screen[top : top + PATTERN.h, left : left + PATTERN.w, 0], image)
 
 
+def test_each_kept_frame_is_photographed_in_white_light_too(command, keyboard, monkeypatch, pattern, tmp_path, capsys):
+    """The camera sees the display: a picture for colours shows no line of the pattern."""
+
+    def take():
+        surface = keyboard.pygame.display.get_surface()
+        shown = np.zeros((768, 1024)) if surface is None else keyboard.pygame.surfarray.array_red(surface).T
+        left, top = (1024 - PATTERN.w) // 2, (768 - PATTERN.h) // 2
+        return photograph(shown[top : top + PATTERN.h, left : left + PATTERN.w] / 255, PLACES[0])
+
+    monkeypatch.setattr(camera_module.cv2, "VideoCapture", lambda _: FakeCapture(take))
+    flags = ["--camera", 0, "--output", tmp_path / "c", "--pattern", pattern, "--show", 0, "--headless", "--frames", 1]
+    keyboard.press(*[""] * 1000)
+    command(main, *flags, "--color", tmp_path / "colours", "--settle", "0.05")
+    assert [path.name for path in (tmp_path / "colours").iterdir()] == ["frame_0000.png"]
+    white, frame = (read_image(tmp_path / folder / "frame_0000.png").mean(-1) for folder in ("colours", "c"))
+    middle = np.s_[frame.shape[0] // 3 : -frame.shape[0] // 3, frame.shape[1] // 3 : -frame.shape[1] // 3]
+    assert white[middle].std() < 5 < 20 < frame[middle].std() and white[middle].mean() > 100
+    assert f"--color {tmp_path / 'colours'}" in capsys.readouterr().out
+    with pytest.raises(SystemExit):
+        command(main, *flags[:3], tmp_path / "other", *flags[4:], "--color", tmp_path / "colours")
+    assert "holds frame_0000.png, and there is no such frame in" in capsys.readouterr().err
+
+
 def test_gray_code_is_shown_and_captured_in_step(in_step, keyboard, tmp_path, capsys):
     sequence = ["SPACE", *[""] * (GRAY.images + 1)]
     early = ["SPACE", "SPACE", ""]  # pressed while the first sequence is decoded
@@ -188,7 +211,7 @@ def test_gray_code_is_shown_and_captured_in_step(in_step, keyboard, tmp_path, ca
     true = (np.linalg.inv(BEFORE_DISPLAY) @ np.stack([x, y, np.ones_like(x)]))[:2].T
     inside = (true > GRAY.cell).all(-1) & (true < np.array([GRAY.w, GRAY.h]) - GRAY.cell).all(-1)
     assert np.abs(decoded.coords[decoded.decoded] - true)[inside].max() < 3
-    assert "sl-process --images" in said.strip().splitlines()[-1]
+    assert "sl-scan " in said.partition("next:")[2]
 
 
 def test_a_camera_that_changes_its_exposure_is_noticed(in_step, keyboard, filmed_screen, capsys):
@@ -245,6 +268,11 @@ def test_control_c_is_a_usual_end(command, video, pattern, tmp_path, capsys, mon
         (["--camera", "VIDEO", "--show", "0"], "--show 0: give --pattern"),
         (["--camera", "VIDEO", "--pattern", "GRAY", "--show", "0"], "Gray code cannot be captured from a video"),
         (["--camera", "0", "--pattern", "GRAY"], "Gray code is shown and captured in step"),
+        (["--camera", "VIDEO", "--pattern", "PATTERN", "--color", "c"], "needs a camera, and a display that shows"),
+        (
+            ["--camera", "0", "--pattern", "GRAY", "--show", "0", "--color", "c"],
+            "Gray code has its own images in white",
+        ),
         (["--camera", "VIDEO", "--pattern", "PATTERN", "--rate", "0"], "--rate 0: give a number above 0"),
         (["--camera", "VIDEO", "--pattern", "PATTERN", "--frames", "0"], "--frames 0: give a number of at least 1"),
         (["--camera", "VIDEO", "--pattern", "PATTERN", "--size", "9"], '--size "9": is no pair of numbers'),

@@ -14,7 +14,7 @@ import torch
 import trimesh
 import tyro
 
-from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_trained, main
+from sl_nerfstudio.cli.export import ExportConfig, check_outputs, export_trained, main, summary
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import read_inputs
 from sl_nerfstudio.geometry.lie import DevicePoses
@@ -51,7 +51,12 @@ def exported(scan: Scan | TrainedRun, output: Path, resolution: int = 48, **flag
 def said(scan: Scan | TrainedRun, output: Path, resolution: int = 48, **flags) -> str:
     config = ExportConfig(Path("c"), output, resolution=resolution, **flags)
     check_outputs(config)
-    return export_trained(run_of(scan) if isinstance(scan, Scan) else scan, config)
+    return summarised(scan, config)
+
+
+def summarised(scan: Scan | TrainedRun, config: ExportConfig) -> str:
+    trained = run_of(scan) if isinstance(scan, Scan) else scan
+    return summary(config, trained.model.scan, export_trained(trained, config))
 
 
 def vertex_data(path: Path) -> np.ndarray:
@@ -90,18 +95,18 @@ def test_the_next_commands_judge_refined_poses_even_if_they_were_not_asked_for(s
     config = ExportConfig(
         Path("run 1/config.yml"), tmp_path / "mesh.ply", resolution=48, fill_holes=2.5, trajectory=("tum", "kitti")
     )
-    export, evaluation = next_commands(export_trained(moved(scan), config))
+    export, evaluation = next_commands(summarised(moved(scan), config))
     again = tyro.cli(ExportConfig, args=export[1:], config=(tyro.conf.FlagCreatePairsOff,))
     assert export[0] == "sl-export" and again == replace(config, poses=tmp_path / "refined", overwrite=True)
     expected = f"sl-eval --mesh {config.output} --data {scan.root} --poses {tmp_path}/refined/transforms.json"
     assert evaluation == [*expected.split(), "--report", "report.html"]
     (tmp_path / "refined").mkdir()  # of somebody else
-    export, evaluation = next_commands(export_trained(moved(scan), config))
+    export, evaluation = next_commands(summarised(moved(scan), config))
     assert export[export.index("--poses") + 1] == str(tmp_path / "mesh-refined")
     assert evaluation[evaluation.index("--poses") + 1] == str(tmp_path / "mesh-refined/transforms.json")
     config = replace(config, output=tmp_path / "b.ply", trajectory=())
-    assert [words[0] for words in next_commands(export_trained(run_of(scan), config))] == ["sl-eval"]
-    (words,) = next_commands(export_trained(moved(scan), replace(config, poses=tmp_path / "p")))
+    assert [words[0] for words in next_commands(summarised(scan, config))] == ["sl-eval"]
+    (words,) = next_commands(summarised(moved(scan), replace(config, poses=tmp_path / "p")))
     assert words[0] == "sl-eval" and words[5:7] == ["--poses", str(tmp_path / "p/transforms.json")]
 
 
@@ -261,7 +266,7 @@ def test_a_texture_is_written_with_the_decimated_mesh_and_described(coloured, tm
 
 
 def test_a_texture_without_pictures_says_what_to_add(scan, tmp_path):
-    with pytest.raises(UserError, match=r"has a picture without(.|\n)*sl_color_path(.|\n)*leave --texture"):
+    with pytest.raises(UserError, match=r"has a picture without(.|\n)*--color(.|\n)*leave --texture"):
         exported(scan, tmp_path / "mesh.glb", texture=512)
     assert list(tmp_path.iterdir()) == []
 

@@ -14,8 +14,8 @@ from sl_nerfstudio.geometry.numerics import component_labels
 from sl_nerfstudio.meshing import texture as module
 from sl_nerfstudio.meshing.files import files_of, read_mesh, write_mesh
 from sl_nerfstudio.meshing.finish import decimate
-from sl_nerfstudio.meshing.mesh import GREY, Charts, Mesh
-from sl_nerfstudio.meshing.texture import Textured, draw_triangles, square_charts, surface_texture, vertex_colours
+from sl_nerfstudio.meshing.mesh import GREY, Charts, Mesh, as_linear, as_srgb
+from sl_nerfstudio.meshing.texture import Colours, Pictures, Textured, draw_triangles, square_charts, surface_texture
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.scan.images import encode_png
 
@@ -27,9 +27,12 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
     return coloured_scan(tmp_path_factory.mktemp("colour") / "scan", pictures=3)
 
 
+def coloured(scan: Scan, mesh: Mesh = BALL) -> Colours:
+    return Pictures(mesh, scan, scan.poses).colours(mesh.vertices, mesh.vertex_normals())
+
+
 def test_vertices_have_the_colour_of_their_place_and_unseen_ones_are_grey(scan):
-    found = vertex_colours(BALL, scan, scan.poses)
-    assert found is not None and found.pictures == 3
+    found = coloured(scan)
     cosine = angle_cosines(scan, range(3), BALL.vertices)
     clearly = (cosine > 0.3).any(0)
     assert found.seen[clearly].all() and not found.seen[(cosine < 0.1).all(0)].any()
@@ -38,19 +41,56 @@ def test_vertices_have_the_colour_of_their_place_and_unseen_ones_are_grey(scan):
     assert (found.rgb[~found.seen] == GREY).all() and 0.2 < found.seen.mean() < 0.8
 
 
-def test_flat_views_weigh_less(scan):
-    """One picture is all white: its share in a vertex is its squared cosine."""
-    white = np.full((PINHOLE.h, PINHOLE.w), 255, dtype=np.uint8)
-    path = scan.root / "color/white.png"
-    path.write_bytes(encode_png(white))
+def test_flat_views_weigh_less(scan, monkeypatch):
+    """One picture has the same value everywhere: its share in a vertex is its squared cosine, of linear light."""
+    monkeypatch.setattr(module, "_ROUNDS", 0)  # as if nothing were known of the exposures
+    path = scan.root / "color/bright.png"
+    path.write_bytes(encode_png(np.full((PINHOLE.h, PINHOLE.w), 240, dtype=np.uint8)))
     first = replace(scan.frames[0], color_path=path)
-    found = vertex_colours(BALL, replace(scan, frames=(first, *scan.frames[1:2])), scan.poses[:2])
-    assert found is not None
+    found = coloured(replace(scan, frames=(first, *scan.frames[1:2])))
     squares = angle_cosines(scan, range(2), BALL.vertices) ** 2
     both = (angle_cosines(scan, range(2), BALL.vertices) > 0.3).all(0)
-    share = squares[0] / squares.sum(0)
-    expected = 255 * (share[:, None] + (1 - share[:, None]) * colour_at(BALL.vertices))
-    assert both.sum() > 100 and np.abs(found.rgb[both] - expected[both]).max() < 5
+    share = (squares[0] / squares.sum(0))[:, None]
+    light = share * as_linear(np.array(240 / 255)) + (1 - share) * as_linear(colour_at(BALL.vertices))
+    assert both.sum() > 100 and np.abs(found.rgb[both] - 255 * as_srgb(light)[both]).max() < 5
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_exposures_are_evened_out_whatever_shadows_and_reflections_say(tmp_path, seed):
+    """Gains of 0.7 to 1.4 in each picture and channel leave the colours as they are, but for one gain of all."""
+    scan, random = coloured_scan(tmp_path / "scan", pictures=4), np.random.default_rng(seed)
+    gains = np.exp(random.uniform(np.log(0.7), np.log(1.4), (4, 3)))
+    for gain, frame in zip(gains, scan.frames, strict=True):
+        light = gain * as_linear(picture(frame.T_world_camera) / 255)
+        x, y = random.integers(20, 80, 2)
+        light[y : y + 12, x : x + 12] *= random.choice([0.2, 3.0])  # a twentieth of the ball is in shadow, or shines
+        frame.color_path.write_bytes(encode_png(np.round(255 * as_srgb(light)).astype(np.uint8)))
+    pictures = Pictures(BALL, scan, scan.poses)
+    wanted = gains / np.exp(np.log(gains).mean(0))
+    assert np.abs(pictures.gains / wanted - 1).max() < 0.02
+    assert list(pictures.exposures()) == [frame.name for frame in scan.frames]
+    found = pictures.colours(BALL.vertices, BALL.vertex_normals())
+    mean = np.exp(np.log(gains).mean(0))
+    expected = 255 * as_srgb(mean * as_linear(colour_at(BALL.vertices)))
+    clearly = (angle_cosines(scan, range(4), BALL.vertices) > 0.3).any(0)
+    error = np.abs(found.rgb[clearly] - expected[clearly])
+    assert np.median(error) < 2 and np.percentile(error, 90) < 6
+
+
+def test_pictures_that_share_nothing_are_compared_among_themselves():
+    values = np.log([[1.0, 2, 9, 9], [2.0, 4, 9, 9], [9, 9, 1, 5], [9, 9, 4, 20]])
+    weights = np.kron(np.eye(2), np.ones((2, 2)))
+    level = module.relative_levels(values, weights)
+    assert np.diff(level)[[0, 2]] == pytest.approx(np.log([2.0, 4.0]), abs=1e-6) and abs(level.sum()) < 1e-9
+    assert module.relative_levels(values[:, :0], weights[:, :0]) == pytest.approx(np.zeros(4))
+
+
+def test_a_capture_in_full_light_shows_only_what_the_projector_lights(scan):
+    frame = scan.frames[0]
+    lit = replace(scan, frames=(replace(frame, color_path=frame.image_path), *scan.frames[3:]))
+    seen = coloured(lit).seen
+    with_all = coloured(replace(scan, frames=(frame, *scan.frames[3:]))).seen
+    assert 0.2 < seen.sum() / with_all.sum() < 1 and not seen[~with_all].any()
 
 
 def test_what_is_hidden_takes_no_colour_from_what_hides_it(scan):
@@ -61,9 +101,7 @@ def test_what_is_hidden_takes_no_colour_from_what_hides_it(scan):
     vertices = np.concatenate([BALL.vertices, plate.vertices]).astype(np.float64)
     faces = np.concatenate([BALL.faces, plate.faces + len(BALL.vertices)]).astype(np.int64)
     alone = replace(scan, frames=scan.frames[:1])
-    open_view = vertex_colours(BALL, alone, scan.poses[:1])
-    found = vertex_colours(Mesh(vertices, faces), alone, scan.poses[:1])
-    assert open_view is not None and found is not None
+    open_view, found = coloured(alone), coloured(alone, Mesh(vertices, faces))
     behind = open_view.seen & ~found.seen[: len(BALL.vertices)]
     ray = BALL.vertices - eye
     off = np.linalg.norm(np.cross(ray, -eye / np.linalg.norm(eye)), axis=1) / np.linalg.norm(ray, axis=1)
@@ -71,14 +109,12 @@ def test_what_is_hidden_takes_no_colour_from_what_hides_it(scan):
     assert (found.rgb[: len(BALL.vertices)][behind] == GREY).all()
 
 
-def test_pictures_with_16_bits_and_a_scan_without_pictures(scan):
-    assert vertex_colours(BALL, replace(scan, frames=scan.frames[3:]), scan.poses[3:]) is None
+def test_pictures_with_16_bits(scan):
     path = scan.root / "color/deep.png"
     path.write_bytes(encode_png(picture(scan.frames[0].T_world_camera).astype(np.uint16) * 257))
     deep = replace(scan, frames=(replace(scan.frames[0], color_path=path),))
     plain = replace(scan, frames=scan.frames[:1])
-    deep_found, found = (vertex_colours(BALL, s, scan.poses[:1]) for s in (deep, plain))
-    assert deep_found is not None and found is not None and np.array_equal(deep_found.rgb, found.rgb)
+    assert np.array_equal(coloured(deep).rgb, coloured(plain).rgb)
 
 
 CAMERA = Device(w=384, h=336, fl_x=900.0, fl_y=930.0, cx=180.0, cy=174.0)
@@ -106,7 +142,7 @@ def mesh(request) -> Mesh:
 
 @pytest.fixture(scope="module")
 def textured(mesh, waving) -> Textured:
-    return surface_texture(mesh, 768, BALL, waving, waving.poses)
+    return surface_texture(mesh, 768, BALL, Pictures(BALL, waving, waving.poses))
 
 
 def loaded(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, Image.Image]:
@@ -162,7 +198,7 @@ def test_smaller_copies_of_the_image_show_nothing_from_between_the_charts(mesh, 
 
 def test_figures_of_a_texture(mesh, textured):
     """The side of a pixel: as many of them as are inside triangles have the area of the surface."""
-    assert textured.pictures == 3 and 0.4 < textured.seen < 0.9
+    assert 0.4 < textured.seen < 0.9
     uv = textured.texture.charts.uv[textured.texture.charts.corners].astype(float) * 768
     a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     pixels = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
@@ -172,7 +208,8 @@ def test_figures_of_a_texture(mesh, textured):
 
 def test_parts_of_a_texture_are_coloured_like_the_whole(waving, mesh, textured, monkeypatch):
     monkeypatch.setattr(module, "_AT_A_TIME", 50_000)
-    assert np.array_equal(surface_texture(mesh, 768, BALL, waving, waving.poses).texture.image, textured.texture.image)
+    again = surface_texture(mesh, 768, BALL, Pictures(BALL, waving, waving.poses))
+    assert np.array_equal(again.texture.image, textured.texture.image)
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj"])

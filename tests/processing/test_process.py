@@ -334,7 +334,7 @@ def test_what_is_written_is_what_was_found(made, tmp_path):
     job, results, poses, _ = made
     previews = []
     with NewFolder(tmp_path / "s") as folder:
-        write_scan(folder, *made, lambda _, shown: previews.extend(shown) or "page")
+        write_scan(folder, *made, {}, lambda _, shown: previews.extend(shown) or "page")
     assert check_scan(tmp_path / "s") == []
     scan = read_scan(tmp_path / "s")
     assert (scan.projector, scan.units, scan.scale) == (job.projector, "arbitrary", poses.scale)
@@ -360,7 +360,7 @@ def test_frames_that_are_not_in_the_scan_are_only_shown(made, tmp_path):
     some = replace(result, frames=(result.frames[0], lost, result.frames[2], replace(lost, name=NAMES[3])))
     previews = []
     with NewFolder(tmp_path / "s") as folder:
-        write_scan(folder, job, [*results[:3], failed], poses, some, lambda _, p: previews.extend(p) or "")
+        write_scan(folder, job, [*results[:3], failed], poses, some, {}, lambda _, p: previews.extend(p) or "")
     scan = read_scan(tmp_path / "s")
     assert [frame.name for frame in scan.frames] == [NAMES[0], NAMES[2]]
     np.testing.assert_allclose(scan.poses.T_world_camera, poses.adjusted.poses.T_world_camera[[0, 2]], atol=1e-12)
@@ -375,5 +375,5 @@ def test_nothing_is_left_if_writing_fails(made, tmp_path):
         pytest.raises(UserError, match=f"the decoded frame {NAMES[0]} is missing"),
         NewFolder(tmp_path / "s") as folder,
     ):
-        write_scan(folder, away, results, poses, result, lambda *_: "")
+        write_scan(folder, away, results, poses, result, {}, lambda *_: "")
     assert not (tmp_path / "s").exists()

@@ -1,0 +1,28 @@
+"""`ns-train sl-neus` as a part of another command."""
+
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+from nerfstudio.configs.method_configs import all_methods
+from nerfstudio.scripts import train
+
+from sl_nerfstudio.model.run_files import part_of, quiet_nerfstudio
+
+
+def settings_of_run(scan: Path, output: Path, experiment: str, name: str, steps: int, refine_poses: str) -> Any:
+    """The settings of a new run in `output`/`experiment`/sl-neus/`name`."""
+    config: Any = deepcopy(all_methods["sl-neus"])
+    config.data, config.output_dir, config.experiment_name, config.timestamp = scan, output, experiment, name
+    config.max_num_iterations, config.pipeline.model.refine_poses = steps, refine_poses
+    return config
+
+
+def train_within(command: str, config: Any) -> None:
+    """Train a new run, or one that was stopped; `command` is what goes on with it.
+
+    Raises SystemExit with a message for what a user can correct, and if it is interrupted.
+    """
+    quiet_nerfstudio(True)
+    with part_of(command):
+        train.main(config)
