@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,9 @@ from sl_nerfstudio.evaluation.agreement import (
 from sl_nerfstudio.evaluation.completeness import Completeness, assess_completeness
 from sl_nerfstudio.evaluation.mesh_faults import MeshFault, find_mesh_faults, missed_axes
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.part_alignment import PartAlignment, place_on_part
 from sl_nerfstudio.evaluation.reference import (
+    MeshReference,
     PointReference,
     PoseErrors,
     Reference,
@@ -52,6 +54,7 @@ from sl_nerfstudio.scan import (
 )
 from sl_nerfstudio.scan.document import TRANSFORMS, check_file, read_document
 from sl_nerfstudio.scan.images import ARRAY_DAMAGE
+from sl_nerfstudio.scan.types import UNITS
 
 # Distances between a reconstructed surface and the truth.
 #
@@ -132,6 +135,9 @@ def default_f_distances(size: float) -> tuple[float, ...]:
 # The files that an evaluation reads: mesh, scan, poses, truth or reference, and what is known about the training.
 
 _FEWEST_POINTS = 100
+_ANOTHER_UNIT = 5.0  # ratio of sizes that no part of an object explains if it does not fit
+FILE_UNITS = {".stl": "mm", ".glb": "m"}
+"""Units of mesh files that have one."""
 
 
 @dataclass(frozen=True)
@@ -150,6 +156,7 @@ class EvaluationInputs:
     quality: VertexQuality | None = None  # of the mesh's vertices, if its file says
     joint: JointCovariance | None = None  # of the evaluated poses, if it is known
     true_units: str | None = None  # of the truth that is compared with, where its files say
+    placed: PartAlignment | None = None  # of the result on a reference mesh that was given
 
     @property
     def stated_sigma(self) -> list[PoseSigma | None]:
@@ -166,11 +173,18 @@ class EvaluationInputs:
 
 
 def read_inputs(
-    mesh: Path, data: Path, poses: Path | None, reference: Path | None, samples: int, seed: int
+    mesh: Path,
+    data: Path,
+    poses: Path | None,
+    reference: Path | None,
+    samples: int,
+    seed: int,
+    reference_unit: str | None = None,
 ) -> EvaluationInputs:
     """Read everything. `poses` is a transforms.json or its folder; `reference` replaces the mesh in ground_truth/.
 
-    `samples` points with `seed` are spread over a true mesh. Raises UserError for anything missing or faulty.
+    A `reference` mesh, whose lengths are in `reference_unit`, may have any axes: the result is placed on it by its
+    shape. `samples` points with `seed` are spread over a true mesh. Raises UserError for anything missing or faulty.
     """
     scan = read_scan(data)
     result = read_mesh(mesh, scan.units)
@@ -180,13 +194,19 @@ def read_inputs(
     quality = read_quality(mesh)
     evaluated = scan.poses if path is None else read_refined_poses(path, scan)
     scan = scan if path is None else read_devices(path, scan)
+    seen_from = truth.poses or evaluated
+    if reference is None or reference.suffix.lower() == ".npz":
+        compared, placed = read_reference(reference or truth.mesh_path, scan, seen_from, samples, seed), None
+    else:
+        compared, placed = read_part(reference, reference_unit, result, scan, seen_from, samples, seed)
     return EvaluationInputs(
         mesh=result,
         scan=scan,
         poses=evaluated,
         true_poses=truth.poses,
-        true_units=truth.units if reference is None else None,
-        reference=read_reference(reference or truth.mesh_path, scan, truth.poses or evaluated, samples, seed),
+        true_units=truth.units if reference is None else reference_unit or FILE_UNITS.get(reference.suffix.lower()),
+        reference=compared,
+        placed=placed,
         poses_path=path,
         pose_sigma=[] if path is None else read_pose_sigmas(path, scan),
         unplaced=[] if path is None else read_unplaced(path, scan),
@@ -224,6 +244,35 @@ def read_reference(path: Path | None, scan: Scan, poses: DevicePoses, samples: i
             "completeness counts all of them",
         )  # fmt: skip
     return mesh_reference(read_mesh(path, scan.units), scan, poses, samples, seed)
+
+
+def read_part(
+    path: Path, unit: str | None, result: Mesh, scan: Scan, poses: DevicePoses, samples: int, seed: int
+) -> tuple[MeshReference, PartAlignment]:
+    """A nominal mesh in any axes, with where `result` lies on it; it is moved there, unless nothing of it fits.
+
+    `unit` is that of the file's lengths; by default the scan's, of .stl millimetres and of .glb metres. Raises UserError
+    if the sizes are those of different units.
+    """
+    of_scan, of_file = UNITS[scan.units], None if unit is None else UNITS[unit]
+    part = read_mesh(path, scan.units if unit is None else "arbitrary")
+    if of_scan and of_file:
+        part = part.mapped(Similarity.scaling(of_file / of_scan))
+    surface, whole = IndexedMesh(result), IndexedMesh(part)
+    placed = place_on_part(surface, whole, with_scale=not of_scan, seed=seed)
+    ratio = surface.diagonal / whole.diagonal
+    if of_scan and not placed.fits and not 1 / _ANOTHER_UNIT < ratio < _ANOTHER_UNIT:
+        stated = unit or FILE_UNITS.get(path.suffix.lower()) or f"{scan.units}, the scan's unit"
+        raise FileError(
+            path,
+            f"measures {whole.diagonal:.4g} {scan.units} from corner to corner, and the scan's surface "
+            f"{surface.diagonal:.4g} {scan.units}",
+            f"its lengths are not in {stated}, or the surface is of something else",
+            "state the unit of the file with --reference-unit; cut the object out with sl-export --object-only",
+        )
+    S = placed.S_part_result.inverse() if placed.fits and not placed.in_place else Similarity.identity()
+    moved = mesh_reference(part.mapped(S), scan, poses, samples, seed)
+    return replace(moved, S_world_file=S), placed
 
 
 def read_points(path: Path) -> Float64[ndarray, "n 3"]:

@@ -1,6 +1,6 @@
 """What a result is compared with, a true mesh or reference points; alignment with it, and errors of poses."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.mesh_index import IndexedMesh, observable
+from sl_nerfstudio.evaluation.mesh_index import Closest, IndexedMesh, observable
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, log_so3
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Scan
@@ -73,9 +73,7 @@ def icp(
     for _ in range(max_iterations):
         moved = S.points(points)
         near = target.closest(moved)
-        weights = _tukey(near.distance, floor=1e-9 * target.diagonal)
-        step = _gauss_newton_step(moved, near.point, near.normal, weights, with_scale)
-        proposed = step @ S
+        proposed = icp_step(moved, near, target, with_scale) @ S
         bounded = float(np.clip(np.log(proposed.scale / start.scale), -_MAX_LOG_SCALE, _MAX_LOG_SCALE))
         S = Similarity(start.scale * float(np.exp(bounded)), proposed.R, proposed.t)
         change = np.abs(S.points(points) - moved).max()
@@ -84,6 +82,12 @@ def icp(
     final = np.sort(target.distance(S.points(points)))
     best = final[: max(1, int(0.8 * len(final)))]
     return Alignment(S, float(np.sqrt((best**2).mean())))
+
+
+def icp_step(points: Float[ndarray, "n 3"], near: Closest, target: IndexedMesh, with_scale: bool) -> Similarity:
+    """One step of `icp`: the motion of points whose nearest points on the target are `near`."""
+    weights = _tukey(near.distance, floor=1e-9 * target.diagonal)
+    return _gauss_newton_step(points, near.point, near.normal, weights, with_scale)
 
 
 def _tukey(distance: Float[ndarray, "n"], floor: float) -> Float[ndarray, "n"]:
@@ -200,6 +204,7 @@ class MeshReference:
     surface: IndexedMesh
     observed: Float[ndarray, "m 3"]
     description: str
+    S_world_file: Similarity = field(default_factory=Similarity.identity)  # from the file's axes, in the scan's unit
 
     @property
     def size(self) -> float:

@@ -8,6 +8,7 @@ import io
 import json
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ def file_from_world(suffix: str, units: str) -> Similarity:
 
 # PLY files with properties of vertices: what a mesh is worth at each of its vertices.
 
+_FACES = "element face {}\nproperty list uchar int vertex_indices"
 _TYPES = {"double": "<f8", "float": "<f4", "int": "<i4", "ushort": "<u2", "uchar": "u1"}  # not all programs read ushort
 
 
@@ -52,17 +54,42 @@ def encode_ply(mesh: Mesh, properties: VertexProperties | None = None, unit: str
     `unit` is said in a comment of the header.
     """
     columns = _columns(mesh.vertices, mesh.vertex_normals(), properties)
-    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
-    faces["count"], faces["corner"] = 3, mesh.faces
-    element = [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
-    return _encode(columns, unit, element) + faces.tobytes()
+    return _encode(columns, _unit_note(unit), [_FACES.format(len(mesh.faces))]) + _encode_faces(mesh)
 
 
 def encode_points(
     points: Float64[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], properties: VertexProperties, unit: str
 ) -> bytes:
     """A binary PLY of points without triangles, with the same properties."""
-    return _encode(_columns(points, normals, properties), unit, [])
+    return _encode(_columns(points, normals, properties), _unit_note(unit), [])
+
+
+def _unit_note(unit: str) -> list[str]:
+    return [f"lengths in {unit}"] if unit else []
+
+
+DEVIATIONS = "deviations from"
+"""How the first comment of a PLY with deviations begins."""
+
+
+def encode_deviations(
+    mesh: Mesh,
+    deviation: Float64[ndarray, "v"],
+    sigma: Float64[ndarray, "v"],
+    colour: UInt8[ndarray, "v 3"],
+    notes: Sequence[str],
+) -> bytes:
+    """A binary PLY with `deviation` and `sigma` of every vertex; `notes` are comments: unit, axes, legend."""
+    columns = _columns(mesh.vertices, mesh.vertex_normals(), None)
+    columns |= {name: ("uchar", colour[:, k]) for k, name in enumerate(("red", "green", "blue"))}
+    columns |= {"deviation": ("float", deviation), "sigma": ("float", sigma)}
+    return _encode(columns, notes, [_FACES.format(len(mesh.faces))]) + _encode_faces(mesh)
+
+
+def _encode_faces(mesh: Mesh) -> bytes:
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
+    faces["count"], faces["corner"] = 3, mesh.faces
+    return faces.tobytes()
 
 
 def _columns(
@@ -85,15 +112,15 @@ def _columns(
     }
 
 
-def _encode(columns: dict[str, tuple[str, ndarray]], unit: str, element: list[str]) -> bytes:
-    """Header and vertices; `element` are the header's lines of what follows them."""
+def _encode(columns: dict[str, tuple[str, ndarray]], notes: Sequence[str], element: list[str]) -> bytes:
+    """Header and vertices; `notes` are comments, `element` the header's lines of what follows the vertices."""
     rows = np.empty(len(columns["x"][1]), dtype=[(name, _TYPES[kind]) for name, (kind, _) in columns.items()])
     for name, (_, values) in columns.items():
         rows[name] = values
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        *([f"comment lengths in {unit}"] if unit else []),
+        *(f"comment {note}" for note in notes),
         f"element vertex {len(rows)}",
         *(f"property {kind} {name}" for name, (kind, _) in columns.items()),
         *element,

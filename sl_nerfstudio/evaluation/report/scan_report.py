@@ -22,6 +22,7 @@ from sl_nerfstudio.evaluation.report import charts
 from sl_nerfstudio.evaluation.report.charts import (
     NO_SURFACE,
     NO_VALUE,
+    ColourLayer,
     ColourScale,
     camera_views,
     colour_layers,
@@ -184,6 +185,7 @@ class ReportInput:
     mesh_name: str
     made_at: datetime = field(default_factory=datetime.now)
     lengths: Sequence[Length] = ()
+    layers: Sequence[ColourLayer] = ()  # of the surface, besides those of every report
 
     @property
     def poses_name(self) -> str:
@@ -260,7 +262,7 @@ def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[Surfac
     colours = None if values is None or scale is None else scale(values)
     views = camera_views(report.inputs.poses.T_world_camera, surface.centre)
     units = report.evaluation.truth_units
-    layers = colour_layers(values, scale, report.inputs.quality, report.evaluation.units, units)
+    layers = [*colour_layers(values, scale, report.inputs.quality, report.evaluation.units, units), *report.layers]
     scan, quality = report.inputs.scan, report.inputs.quality
     devices = SceneDevices([f.name for f in scan.frames], [f.camera for f in scan.frames], scan.projector)
     sigma = None if quality is None else quality.sigma
