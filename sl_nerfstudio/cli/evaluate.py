@@ -241,8 +241,8 @@ def _place_words(placed: "PartAlignment", name: str, unit: str, factor: float) -
     """Say how the surface came to its place, and what of the place its shape leaves open."""
     if not placed.fits:
         return [
-            f"the surface fits {name} nowhere to 1 % of its size ({factor * placed.rms:.3g} {unit} RMS at the best place), so it "
-            "stays in its own axes: what follows compares two different things"
+            f"the surface fits {name} nowhere to 1 % of its size ({factor * placed.rms:.3g} {unit} RMS at the best "
+            "place), so it stays in its own axes: what follows compares two different things"
         ]
     where = "lies in its axes" if placed.in_place else f"placed on {name} by its shape"
     rival = "" if placed.next_rms is None else f"; at the next best place {factor * placed.next_rms:.3g} {unit}"
@@ -295,8 +295,8 @@ def _inspection_notes(found: "Inspection", unit: str, factor: float) -> list[str
         notes.append(f"{found.unmeasured:.1%} of the surface is confirmed by no frame, and counts nowhere below")
     if found.facet_error > 0.1 * (found.tolerance or found.rms):
         notes.append(
-            f"the file's facets are {factor * found.facet_error:.2g} {unit} (RMS) from the curved surfaces that they stand for: "
-            "export the part with finer facets"
+            f"the file's facets are {factor * found.facet_error:.2g} {unit} (RMS) from the curved surfaces that they "
+            "stand for: export the part with finer facets"
         )
     return notes
 
@@ -411,6 +411,7 @@ def _evaluate(config: EvalConfig) -> None:
         from sl_nerfstudio.evaluation.evaluate import evaluate, measure_lengths, read_inputs, typical_sigma
         from sl_nerfstudio.evaluation.inspection import inspect
         from sl_nerfstudio.evaluation.judgement import further_commands, judge, to_json, trained_steps
+        from sl_nerfstudio.evaluation.reference import MeshReference
         from sl_nerfstudio.evaluation.report.scan_report import ResidualThumbnails, intrinsics_hint
         from sl_nerfstudio.evaluation.shape_fits import fit_shape, parse_region
         from sl_nerfstudio.storage import write_atomic
@@ -431,8 +432,10 @@ def _evaluate(config: EvalConfig) -> None:
             true_units=inputs.true_units,
         )  # fmt: skip
         inspected = None
-        if config.reference is not None or tolerance is not None or config.deviations is not None:
-            inspected = inspect(inputs.mesh, inputs.quality, evaluation, tolerance)
+        wanted = config.reference is not None or tolerance is not None or config.deviations is not None
+        if wanted and isinstance(evaluation.reference, MeshReference):
+            S, part = evaluation.surface[evaluation.alignment].S_truth_result, evaluation.reference.surface.mesh
+            inspected = inspect(inputs.mesh, part, S, tolerance, inputs.quality)
         fits = [fit_shape(region, inputs.mesh, inputs.scan, inputs.poses, inputs.joint) for region in regions]
         sigma = typical_sigma(inputs.mesh, inputs.quality, inputs.scan, inputs.poses, inputs.joint)
     with phase("advise"):

@@ -249,17 +249,17 @@ def read_reference(path: Path | None, scan: Scan, poses: DevicePoses, samples: i
 def read_part(
     path: Path, unit: str | None, result: Mesh, scan: Scan, poses: DevicePoses, samples: int, seed: int
 ) -> tuple[MeshReference, PartAlignment]:
-    """A nominal mesh in any axes, with where `result` lies on it; it is moved there, unless nothing of it fits.
+    """A nominal mesh in any axes, with where `result` lies on it, unless that fits nowhere.
 
-    `unit` is that of the file's lengths; by default the scan's, of .stl millimetres and of .glb metres. Raises UserError
-    if the sizes are those of different units.
+    `unit` is that of the file's lengths; by default the scan's, of .stl millimetres and of .glb metres. Raises
+    UserError if the sizes are those of different units.
     """
     of_scan, of_file = UNITS[scan.units], None if unit is None else UNITS[unit]
     part = read_mesh(path, scan.units if unit is None else "arbitrary")
     if of_scan and of_file:
         part = part.mapped(Similarity.scaling(of_file / of_scan))
     surface, whole = IndexedMesh(result), IndexedMesh(part)
-    placed = place_on_part(surface, whole, with_scale=not of_scan, seed=seed)
+    placed = place_on_part(result, part, with_scale=not of_scan, seed=seed)
     ratio = surface.diagonal / whole.diagonal
     if of_scan and not placed.fits and not 1 / _ANOTHER_UNIT < ratio < _ANOTHER_UNIT:
         stated = unit or FILE_UNITS.get(path.suffix.lower()) or f"{scan.units}, the scan's unit"
@@ -270,9 +270,10 @@ def read_part(
             f"its lengths are not in {stated}, or the surface is of something else",
             "state the unit of the file with --reference-unit; cut the object out with sl-export --object-only",
         )
-    S = placed.S_part_result.inverse() if placed.fits and not placed.in_place else Similarity.identity()
-    moved = mesh_reference(part.mapped(S), scan, poses, samples, seed)
-    return replace(moved, S_world_file=S), placed
+    if placed.in_place or not placed.fits:
+        return mesh_reference(part, scan, poses, samples, seed), placed
+    seen = mesh_reference(part, scan, poses.mapped(placed.S_part_result), samples, seed)
+    return replace(seen, start=placed.S_part_result), placed
 
 
 def read_points(path: Path) -> Float64[ndarray, "n 3"]:
@@ -404,17 +405,19 @@ def score_alignments(
 ) -> dict[str, SurfaceScore]:
     """Scores after rigid ICP, after ICP with scale, and without any alignment.
 
-    ICP starts from where the result is. With true poses (or others in the reference's world) it starts a second time
+    ICP starts from where the result is; on a reference in other axes only from its place there, and there is no score
+    without alignment. With true poses (or others in the reference's world) it starts a second time
     from the map of the estimated devices onto those, and the better result counts.
     """
     points, _ = surface.sample(samples, seed)
     distances = tuple(f_distances) or default_f_distances(reference.size)
+    start = reference.start if isinstance(reference, MeshReference) else None
     scores = {}
-    for name in ALIGNMENTS:
+    for name in ALIGNMENTS if start is None else ALIGNMENTS[:-1]:
         S = Similarity.identity()
         if name != "none":
             with_scale = name == "similarity"
-            starts = _starts(poses, true_poses, with_scale, points, 1e-6 * surface.diagonal)
+            starts = [start] if start else _starts(poses, true_poses, with_scale, points, 1e-6 * surface.diagonal)
             ends = [reference.align(surface, points, start, with_scale) for start in starts]
             S = min(ends, key=lambda end: end.residual).S_target_source
         scores[name] = score_surface(surface, points, reference, S, distances)

@@ -11,9 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 from numpy import ndarray
 
-from sl_nerfstudio.evaluation.evaluate import Evaluation
+from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.part_alignment import facet_sag
-from sl_nerfstudio.evaluation.reference import MeshReference
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 
@@ -24,9 +23,9 @@ _HIGHEST = 90.0  # percentile of the deviations of a patch that counts as its he
 
 @dataclass(frozen=True)
 class Patch:
-    """A connected piece of the surface that is out of tolerance; lengths in the unit of the truth."""
+    """A connected piece of the surface that is out of tolerance; lengths in the part's unit."""
 
-    place: tuple[float, float, float]  # in the axes of the part's file, where the deviation is largest
+    place: tuple[float, float, float]  # in the part's axes, where the deviation is largest
     area: float
     mean: float
     height: float  # 90 % of its deviations are smaller in size
@@ -35,12 +34,12 @@ class Patch:
 
 @dataclass(frozen=True)
 class Inspection:
-    """Deviations of a result from its part; lengths in the unit of the truth, shares of the result's area."""
+    """Deviations of a result from its part; lengths in the part's unit, shares of the result's area."""
 
     deviation: Float64[ndarray, "v"]  # of every vertex
     sigma: Float64[ndarray, "v"] | None  # 1 sigma along the normal, NaN where not measured; None: not stated
     tolerance: float | None
-    S_part_mesh: Similarity  # from the mesh's world to the axes of the part's file
+    S_part_mesh: Similarity  # from the mesh's world to the part's axes
     mean: float
     median: float
     rms: float
@@ -67,23 +66,25 @@ def _certain_excess(
 
 
 def inspect(
-    mesh: Mesh, quality: VertexQuality | None, evaluation: Evaluation, tolerance: float | None
-) -> Inspection | None:
-    """Compare a result with its part; None where it was compared with points, or with nothing.
+    mesh: Mesh,
+    part: Mesh,
+    S_part_mesh: Similarity,
+    tolerance: float | None = None,
+    quality: VertexQuality | None = None,
+) -> Inspection:
+    """Compare a result with its nominal part.
 
     Args:
-        mesh: the result, in the scan's world.
-        quality: of its vertices; None if they state no uncertainty.
-        evaluation: of the mesh, with the reference on which it was placed, and its alignment there.
-        tolerance: largest deviation allowed on either side, in the unit of the truth.
+        mesh: the result.
+        part: the nominal surface, its triangles counter-clockwise as seen from outside.
+        S_part_mesh: where the result lies in the part's axes and unit: `PartAlignment.S_part_result`, or another.
+        tolerance: largest deviation allowed on either side, in the part's unit.
+        quality: of the mesh's vertices, in its unit: `read_quality` of its file; None if they state no uncertainty.
     """
-    reference = evaluation.reference
-    if not isinstance(reference, MeshReference):
-        return None
-    S_truth_mesh = evaluation.surface[evaluation.alignment].S_truth_result
-    deviation = reference.signed_distance(S_truth_mesh.points(mesh.vertices))
-    sigma = None if quality is None else quality.sigma * S_truth_mesh.scale
-    area = _vertex_areas(mesh) * S_truth_mesh.scale**2
+    indexed = IndexedMesh(part)
+    deviation = indexed.signed_distance(S_part_mesh.points(mesh.vertices))
+    sigma = None if quality is None else quality.sigma * S_part_mesh.scale
+    area = _vertex_areas(mesh) * S_part_mesh.scale**2
     measured = area > 0 if sigma is None else np.isfinite(sigma) & (area > 0)
     if not measured.any():
         sigma, measured = None, area > 0
@@ -98,7 +99,6 @@ def inspect(
         beyond = float(a[out[measured]].sum() / a.sum())
         within = float(a[np.abs(d) + margin <= tolerance].sum() / a.sum())
         undecided = max(0.0, 1.0 - within - beyond)
-    S_part_mesh = reference.S_world_file.inverse() @ S_truth_mesh
     return Inspection(
         deviation=deviation,
         sigma=sigma,
@@ -115,7 +115,7 @@ def inspect(
         undecided=undecided,
         out=beyond,
         patches=_patches(mesh, deviation, sigma, out, area, S_part_mesh),
-        facet_error=facet_sag(reference.surface),
+        facet_error=facet_sag(indexed),
     )
 
 

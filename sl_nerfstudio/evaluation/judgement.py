@@ -460,9 +460,9 @@ def to_json(
     `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
     errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`. `fit`, the agreement with
     the captures, is always there, and so are `verdict` and `reasons`. `coverage` says what the surface lacks and what
-    to capture next; `cross_frame` is the agreement of the frames with each other, `lengths` and `fits` are the distances
-    and shapes that were asked for. `inspection` has the deviations from a nominal part, `part` where the surface lies on
-    it and what its shape leaves open.
+    to capture next; `cross_frame` is the agreement of the frames with each other, `lengths` and `fits` are the
+    distances and shapes that were asked for. `inspection` has the deviations from a nominal part, `part` where the
+    surface lies on it and what its shape leaves open.
     """
     out: dict[str, Any] = {
         "format": 1,

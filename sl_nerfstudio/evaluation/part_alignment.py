@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.evaluation.mesh_index import Closest, IndexedMesh, neighbours
 from sl_nerfstudio.evaluation.reference import icp_step
 from sl_nerfstudio.geometry.lie import AXIS_TURNS, Similarity
+from sl_nerfstudio.meshing.mesh import Mesh
 
 _STARTS = 120  # random orientations, besides those of the principal axes
 _ROUNDS = ((200, 14, 48), (1000, 20, 24), (3000, 25, 24))  # points, ICP steps, places that are kept
@@ -108,16 +109,19 @@ class _Points:
         return now
 
 
-def place_on_part(result: IndexedMesh, part: IndexedMesh, with_scale: bool, seed: int = 0) -> PartAlignment:
-    """Place a result, all or a piece of the part's surface, in the part's axes.
+def place_on_part(result: Mesh, part: Mesh, with_scale: bool = False, seed: int = 0) -> PartAlignment:
+    """Place a surface, all or a piece of the part's, in the part's axes, wherever it is now.
 
     Args:
         result: in any axes; in the part's unit unless `with_scale`.
-        part: the nominal surface, with outward normals.
+        part: the nominal surface, its triangles counter-clockwise as seen from outside.
         with_scale: the result's unit is not known.
         seed: of the orientations from which the search starts.
+
+    The place is the best there is; whether it is good is said by `PartAlignment.fits`.
     """
-    every = _Points(part, *result.sample(_ROUNDS[-1][0], seed))
+    indexed = IndexedMesh(part)
+    every = _Points(indexed, *IndexedMesh(result).sample(_ROUNDS[-1][0], seed))
     places = _starts(every, with_scale, seed)
     costs = np.empty(0)
     for count, steps, kept in _ROUNDS:
@@ -127,7 +131,7 @@ def place_on_part(result: IndexedMesh, part: IndexedMesh, with_scale: bool, seed
         order = np.argsort(costs)
         places, costs = _distinct([places[k] for k in order], costs[order], every, OPEN_TO_NOTHING, kept)
     # Below the facets' own distance from the surfaces, and below rounding, places do not differ.
-    fits = _AS_GOOD * costs[0] + facet_sag(part) ** 2 + (_EXACT * part.diagonal) ** 2
+    fits = _AS_GOOD * costs[0] + facet_sag(indexed) ** 2 + (_EXACT * indexed.diagonal) ** 2
     # The axes that the result has count before others that fit no better.
     own = every.followed([Similarity.identity()], 2 * _ROUNDS[-1][1], with_scale)[0]
     in_place = bool(every.costs([own])[0] <= fits and _small(own, every))
@@ -141,7 +145,7 @@ def place_on_part(result: IndexedMesh, part: IndexedMesh, with_scale: bool, seed
         places[0],
         in_place,
         every.rms(places[0]),
-        part.diagonal,
+        indexed.diagonal,
         motions,
         tuple(turns),
         every.rms(worse[0]) if worse else None,

@@ -1,6 +1,6 @@
 """What a result is compared with, a true mesh or reference points; alignment with it, and errors of poses."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -204,7 +204,7 @@ class MeshReference:
     surface: IndexedMesh
     observed: Float[ndarray, "m 3"]
     description: str
-    S_world_file: Similarity = field(default_factory=Similarity.identity)  # from the file's axes, in the scan's unit
+    start: Similarity | None = None  # where the result lies on it, if that is not where it is in the world
 
     @property
     def size(self) -> float:
@@ -215,17 +215,11 @@ class MeshReference:
         """Distance from the nearest point on the triangles, observed or not."""
         return self.surface.distance(points)
 
-    def signed_distance(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-        """Distance from the nearest point on the triangles, negative behind it (inside the object)."""
-        near = self.surface.closest(points)
-        behind = ((points - near.point) * near.normal).sum(1) < 0
-        return np.where(behind, -near.distance, near.distance)
-
     def surface_errors(
         self, result: IndexedMesh, S_truth_result: Similarity, points: Float[ndarray, "n 3"]
     ) -> Float[ndarray, "n"]:
         """Signed distances, for colours, of `points` on the result (in the frame of the result) from the truth."""
-        return self.signed_distance(S_truth_result.points(points))
+        return self.surface.signed_distance(S_truth_result.points(points))
 
     def align(
         self, result: IndexedMesh, samples: Float[ndarray, "n 3"], start: Similarity, with_scale: bool
