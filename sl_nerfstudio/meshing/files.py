@@ -129,9 +129,9 @@ def _encode(columns: dict[str, tuple[str, ndarray]], notes: Sequence[str], eleme
     return "\n".join(header).encode("ascii") + rows.tobytes()
 
 
-def read_quality(path: Path) -> VertexQuality | None:
+def read_quality(path: Path | str) -> VertexQuality | None:
     """What `encode_ply` wrote with a mesh; None for any other file."""
-    with path.open("rb") as stream:
+    with Path(path).open("rb") as stream:
         if stream.read(3) != b"ply":
             return None
         head, mark, _ = (b"ply" + stream.read(65536)).partition(b"end_header\n")
@@ -425,7 +425,7 @@ def files_of(path: Path, textured: bool = False) -> tuple[Path, ...]:
 
 
 def write_mesh(
-    path: Path,
+    path: Path | str,
     mesh: Mesh,
     properties: VertexProperties | None = None,
     units: str = "arbitrary",
@@ -439,6 +439,7 @@ def write_mesh(
     with y up: see `file_from_world`. Raises UserError for an unknown suffix, a mesh without triangles, a vertex that is
     not a number, or a place where writing is impossible; ValueError for a texture where the format has none.
     """
+    path = Path(path)
     suffix = check_suffix(path)
     if texture is not None and suffix not in TEXTURE_SUFFIXES:
         raise ValueError(f"{suffix} files have no texture")
@@ -470,7 +471,7 @@ def write_mesh(
         write_atomic(path, encode_glb(placed, colour, texture))
 
 
-def read_mesh(path: Path, units: str = "arbitrary") -> Mesh:
+def read_mesh(path: Path | str, units: str = "arbitrary") -> Mesh:
     """Read the triangles of a mesh file, all parts of it in one; polygons are cut into triangles.
 
     GLB, which is in metres with y up, and STL, in millimetres, are taken into a world with z up whose lengths are in
@@ -479,6 +480,7 @@ def read_mesh(path: Path, units: str = "arbitrary") -> Mesh:
     not share them. Raises UserError if the file is missing, empty, damaged, too large, without triangles, refers to
     vertices that do not exist, or holds values that are not numbers.
     """
+    path = Path(path)
     suffix = check_suffix(path)
     check_file(path)
     try:
