@@ -31,13 +31,15 @@ def main(folder: str, output: str) -> None:
     found = sl.adjust_registered(clouds, sl.register(clouds))
     print(f"frames agree to {found.median_after_px:.2f} px")
     pattern = np.rint(255 * truth.read_pattern()).astype(np.uint8)
-    with sl.ScanWriter(output, units="arbitrary", scale=sl.Scale(known=False), projector=projector,
-                       pattern=pattern, camera=camera) as writer:  # fmt: skip
-        for frame, cloud, T_c, T_p, sigma in zip(truth.frames, clouds, found.poses.T_world_camera,
-                                                 found.poses.T_world_projector, found.sigma, strict=True):  # fmt: skip
-            if sigma is not None:  # else it could not be registered
-                writer.add_frame(frame.name, image=frame.read_image(), coords=cloud.coords, T_world_camera=T_c,
-                                 T_world_projector=T_p, pose_sigma=sigma)  # fmt: skip
+    devices = {"projector": projector, "pattern": pattern, "camera": camera}
+    with sl.ScanWriter(output, units="arbitrary", scale=sl.Scale(known=False), **devices) as writer:
+        for k, (frame, cloud) in enumerate(zip(truth.frames, clouds, strict=True)):
+            if found.sigma[k] is None:
+                continue  # it could not be registered
+            poses = {name: T[k] for name, T in vars(found.poses).items()}
+            writer.add_frame(
+                frame.name, image=frame.read_image(), coords=cloud.coords, pose_sigma=found.sigma[k], **poses
+            )
     print(f"{output}: {len(sl.read_scan(output).frames)} frames")
 
 

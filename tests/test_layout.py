@@ -12,7 +12,7 @@ LAYERS = (
     "errors", "console", "parallel", "late_imports", "storage", "geometry", "scan", "pattern", "synthesis", "decoding",
     "capture", "calibration", "relative_pose", "matching", "registration", "bundle_adjustment", "review",
     "object_separation", "processing", "field", "rendering", "meshing", "dataparser", "model", "runs", "redecoding",
-    "evaluation", "cli", "methods", "__main__",
+    "evaluation", "api", "cli", "methods", "__main__",
 )  # fmt: skip
 PLUGIN = {"dataparser", "model", "methods"}  # nerfstudio's import takes ten seconds
 MODULES = sorted(PACKAGE.rglob("*.py"))
