@@ -61,7 +61,7 @@ def test_devices_come_back_from_their_file(tmp_path: Path) -> None:
 
 
 def test_wrong_input_is_said_as_everywhere(tmp_path: Path) -> None:
-    with pytest.raises(sl.UserError, match="2 images of .*, which a single one shows"):
+    with pytest.raises(sl.UserError, match=r"2 images of .*, which a single one shows"):
         sl.decode_image([np.zeros((9, 9), np.uint8)] * 2, make_grid())
     with pytest.raises(sl.UserError, match=r"none\.json"):
         sl.decode_image(tmp_path / "a.png", tmp_path / "none.json")

@@ -32,7 +32,8 @@ def test_a_box_fits_in_four_ways_and_one_in_its_own_axes_stays_there() -> None:
     half_turns = sorted(np.abs(np.diag(R)).round(6).tolist() + np.diag(R).round(2).tolist() for R in found.equal_turns)
     assert half_turns == [[1, 1, 1, -1, -1, 1], [1, 1, 1, -1, 1, -1], [1, 1, 1, 1, -1, -1]]
     near = Similarity(1.0, np.eye(3), np.array([0.4, -0.2, 0.1]))
-    assert (there := place_on_part(scanned(box, S=near), box)).in_place
+    there = place_on_part(scanned(box, S=near), box)
+    assert there.in_place
     np.testing.assert_allclose(there.S_part_result.matrix(), near.inverse().matrix(), atol=0.01)
 
 
