@@ -32,10 +32,8 @@ def main(captures: str, output: str) -> None:
     with sl.ScanWriter(output, units="arbitrary", scale=scale, projector=given.projector, pattern=pattern) as writer:
         for k, (frame, cloud) in enumerate(zip(given.frames, clouds, strict=True)):
             if found.sigma[k] is not None:  # else it could not be registered
-                poses = {name: T[k] for name, T in vars(found.poses).items()}
-                writer.add_frame(
-                    frame.name, image=frame.read_image(), coords=cloud.coords, camera=frame.camera, **poses
-                )
+                image, poses = frame.read_image(), {name: T[k] for name, T in vars(found.poses).items()}
+                writer.add_frame(frame.name, image=image, coords=cloud.coords, camera=frame.camera, **poses)
 
 
 if __name__ == "__main__":

@@ -95,10 +95,10 @@ def inspect(
     out = _certain_excess(deviation, sigma, tolerance) > 0
     within = undecided = beyond = None
     if tolerance is not None:
-        margin = 0.0 if sigma is None else _SIGMAS * sigma[measured]
-        beyond = float(a[out[measured]].sum() / a.sum())
-        within = float(a[np.abs(d) + margin <= tolerance].sum() / a.sum())
-        undecided = max(0.0, 1.0 - within - beyond)
+        inside = np.abs(d) + (0.0 if sigma is None else _SIGMAS * sigma[measured]) <= tolerance
+        outside = out[measured]
+        shares = (float(a[chosen].sum() / a.sum()) for chosen in (inside, outside, ~(inside | outside)))
+        within, beyond, undecided = shares
     return Inspection(
         deviation=deviation,
         sigma=sigma,

@@ -376,8 +376,8 @@ def standing(align: Standing | None, mesh: Mesh, scan: Scan, poses: DevicePoses)
     """
     if align is None:
         return Similarity.identity()
+    up = np.nanmean(poses.T_world_camera[:, :3, 1], axis=0)
     if align == "z-up":
-        up = np.nanmean(poses.T_world_camera[:, :3, 1], axis=0)
         if np.linalg.norm(up) < _LEAST_UP:
             raise UserError(
                 "--align z-up: the cameras agree on no direction that is up\n"
@@ -385,14 +385,14 @@ def standing(align: Standing | None, mesh: Mesh, scan: Scan, poses: DevicePoses)
                 "    remedy: give --align plane, or leave --align out"
             )
         return Similarity(1.0, _turned_to_z(up), np.zeros(3))
-    stands = [one for one in separate_scan(scan, poses).findings if one.verdict == "object stands on it"]
-    if not stands:
+    below = [one.finding.plane for one in separate_scan(scan, poses).surroundings]
+    plane = max(below, key=lambda one: float(one.normal @ up), default=None)
+    if plane is None or plane.normal @ up < _LEAST_UP * np.linalg.norm(up):  # others are walls
         raise UserError(
             "--align plane: no plane was found on which the object stands\n"
             "    cause:  the captures show no table, or it was left out of the scan by --object-only or a mask\n"
             "    remedy: give --align z-up, or leave --align out"
         )
-    plane = max(stands, key=lambda one: one.share).plane
     R = _turned_to_z(plane.normal)
     low, high = mesh.mapped(Similarity(1.0, R, np.zeros(3))).bounds()
     x, y = (low + high)[:2] / 2
