@@ -194,11 +194,11 @@ def read_inputs(
     quality = read_quality(mesh)
     evaluated = scan.poses if path is None else read_refined_poses(path, scan)
     scan = scan if path is None else read_devices(path, scan)
-    seen_from = truth.poses or evaluated
     if reference is None or reference.suffix.lower() == ".npz":
-        compared, placed = read_reference(reference or truth.mesh_path, scan, seen_from, samples, seed), None
+        path_of_truth = reference or truth.mesh_path
+        compared, placed = read_reference(path_of_truth, scan, truth.poses or evaluated, samples, seed), None
     else:
-        compared, placed = read_part(reference, reference_unit, result, scan, seen_from, samples, seed)
+        compared, placed = read_part(reference, reference_unit, result, scan, evaluated, truth.poses, samples, seed)
     return EvaluationInputs(
         mesh=result,
         scan=scan,
@@ -247,7 +247,14 @@ def read_reference(path: Path | None, scan: Scan, poses: DevicePoses, samples: i
 
 
 def read_part(
-    path: Path, unit: str | None, result: Mesh, scan: Scan, poses: DevicePoses, samples: int, seed: int
+    path: Path,
+    unit: str | None,
+    result: Mesh,
+    scan: Scan,
+    poses: DevicePoses,
+    true_poses: DevicePoses | None,
+    samples: int,
+    seed: int,
 ) -> tuple[MeshReference, PartAlignment]:
     """A nominal mesh in any axes, with where `result` lies on it, unless that fits nowhere.
 
@@ -258,20 +265,19 @@ def read_part(
     part = read_mesh(path, scan.units if unit is None else "arbitrary")
     if of_scan and of_file:
         part = part.mapped(Similarity.scaling(of_file / of_scan))
-    surface, whole = IndexedMesh(result), IndexedMesh(part)
     placed = place_on_part(result, part, with_scale=not of_scan, seed=seed)
-    ratio = surface.diagonal / whole.diagonal
-    if of_scan and not placed.fits and not 1 / _ANOTHER_UNIT < ratio < _ANOTHER_UNIT:
+    size, size_of_part = (float(np.linalg.norm(np.subtract(*mesh.bounds()))) for mesh in (result, part))
+    if of_scan and not placed.fits and not 1 / _ANOTHER_UNIT < size / size_of_part < _ANOTHER_UNIT:
         stated = unit or FILE_UNITS.get(path.suffix.lower()) or f"{scan.units}, the scan's unit"
         raise FileError(
             path,
-            f"measures {whole.diagonal:.4g} {scan.units} from corner to corner, and the scan's surface "
-            f"{surface.diagonal:.4g} {scan.units}",
+            f"measures {size_of_part:.4g} {scan.units} from corner to corner, and the scan's surface "
+            f"{size:.4g} {scan.units}",
             f"its lengths are not in {stated}, or the surface is of something else",
             "state the unit of the file with --reference-unit; cut the object out with sl-export --object-only",
         )
     if placed.in_place or not placed.fits:
-        return mesh_reference(part, scan, poses, samples, seed), placed
+        return mesh_reference(part, scan, true_poses or poses, samples, seed), placed
     seen = mesh_reference(part, scan, poses.mapped(placed.S_part_result), samples, seed)
     return replace(seen, start=placed.S_part_result), placed
 

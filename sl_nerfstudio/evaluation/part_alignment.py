@@ -28,7 +28,7 @@ _SAME_TURN_DEG, _SAME_SHIFT = 3.0, 0.02  # places that are nearer (shift: of the
 _SMALL = 0.1  # of the diagonal: a result that need not move farther is in the part's axes already
 _AS_GOOD = 1.1  # ratio of mean squared distances up to which two places fit equally well
 _EXACT = 1e-5  # of the diagonal: smaller distances are rounding
-_FITS = 0.01  # of the diagonal: RMS distance up to which a result is a surface of the part
+_FITS = 0.01  # of the smaller diagonal: RMS distance up to which a result is a surface of the part
 _WEAK = 0.03  # of the largest curvature of the distances: below, a motion is tried
 _TRIED = ((0.17, 0.02), (-0.17, -0.02))  # motions along a weak direction: radian, or share of the diagonal
 _SMOOTH_DEG = 30.0  # between neighbouring facets of one curved surface, at most
@@ -55,7 +55,7 @@ class PartAlignment:
     S_part_result: Similarity
     in_place: bool  # the result lies there in its own axes, to within a small motion
     rms: float  # of the nearest 80 % of the result
-    size: float  # diagonal of the part
+    size: float  # diagonal of the result or of the part, whichever is smaller
     open_motions: OpenMotions
     equal_turns: tuple[Float64[ndarray, "3 3"], ...]  # rotations of the part after which it fits equally well
     next_rms: float | None  # at the best place that fits less well; None if no such place was found
@@ -121,7 +121,8 @@ def place_on_part(result: Mesh, part: Mesh, with_scale: bool = False, seed: int 
     The place is the best there is; whether it is good is said by `PartAlignment.fits`.
     """
     indexed = IndexedMesh(part)
-    every = _Points(indexed, *IndexedMesh(result).sample(_ROUNDS[-1][0], seed))
+    whole = IndexedMesh(result)
+    every = _Points(indexed, *whole.sample(_ROUNDS[-1][0], seed))
     places = _starts(every, with_scale, seed)
     costs = np.empty(0)
     for count, steps, kept in _ROUNDS:
@@ -145,7 +146,7 @@ def place_on_part(result: Mesh, part: Mesh, with_scale: bool = False, seed: int 
         places[0],
         in_place,
         every.rms(places[0]),
-        indexed.diagonal,
+        min(indexed.diagonal, places[0].scale * whole.diagonal),
         motions,
         tuple(turns),
         every.rms(worse[0]) if worse else None,
