@@ -24,6 +24,8 @@ def main() -> None:
     linked = copy_pages()
     config = yaml.safe_load((ROOT / "docs" / "mkdocs.yml").read_text())
     config["exclude_docs"] = "\n".join(f"!/{path}" for path in sorted(linked))
+    # pages show examples as they are: `--8<-- "examples/FILE"`
+    config["markdown_extensions"].append({"pymdownx.snippets": {"base_path": [str(ROOT)], "check_paths": True}})
     config["nav"].append({CODE: write_code_pages()})
     settings = ROOT / "build" / "mkdocs.yml"
     settings.write_text(yaml.safe_dump(config))

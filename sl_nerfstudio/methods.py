@@ -1,19 +1,24 @@
 """`ns-train sl-neus` and `ns-train sl-neus-paper`."""
 
+import copy
 import inspect
 import sys
+from dataclasses import fields
+from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, MachineConfig, ViewerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
+from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.late_imports import end_imports
 from sl_nerfstudio.model.model import RECOMMENDED_STEPS, SLModelConfig, paper_model
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
+from sl_nerfstudio.model.run_files import quiet_nerfstudio
 from sl_nerfstudio.model.trainer import SLTrainerConfig, default_device
 
 # When nerfstudio has loaded this module, it asks for the call stack 26 times, and each time Python looks through all
@@ -110,3 +115,47 @@ sl_neus_paper = MethodSpecification(
     description="The method of Furukawa, Nishihara and Kawasaki (2025), for comparison; three details differ: xyz as "
     "input, a rounded ReLU, coordinates divided by the accumulated weight.",
 )
+
+
+def train(
+    scan: Path | str,
+    output: Path | str,
+    name: str = "run",
+    steps: int | None = None,
+    method: Literal["sl-neus", "sl-neus-paper"] = "sl-neus",
+    **settings: Any,
+) -> Path:
+    """Train the surface of a scan, as `ns-train` does, with the GPU if there is one.
+
+    Args:
+        scan: the scan folder.
+        output: the run is written to output/SCAN/METHOD/NAME.
+        name: of the run; one of that name must not be there.
+        steps: of the training; default: as many as the method recommends.
+        method: `sl-neus`, or the paper's own.
+        settings: fields of `SLModelConfig`, such as `refine_poses="rigid-rig"`.
+
+    Returns the run's config.yml, which `load_run` takes. Raises UserError for a faulty scan, settings that do not
+    exist, and a folder that is in use.
+    """
+    method_config = {"sl-neus": sl_neus, "sl-neus-paper": sl_neus_paper}[method].config
+    config: Any = copy.deepcopy(method_config)
+    config.data, config.output_dir, config.timestamp = Path(scan), Path(output), name
+    config.experiment_name = Path(scan).absolute().name
+    config.max_num_iterations = config.max_num_iterations if steps is None else steps
+    config.pipeline.datamanager.data = config.data
+    unknown = sorted(set(settings) - {field.name for field in fields(config.pipeline.model)})
+    if unknown:
+        raise UserError(
+            f"train: {', '.join(unknown)}: there is no such setting\n    cause:  a typing error\n"
+            "    remedy: settings are those that ns-train sl-neus --help lists as --pipeline.model"
+        )
+    for field, value in settings.items():
+        setattr(config.pipeline.model, field, value)
+    from nerfstudio.scripts.train import train_loop  # which itself loads this module, for its list of methods
+
+    quiet_nerfstudio(True)
+    config.begin()
+    config.save_config()
+    train_loop(0, 1, config)
+    return config.get_base_dir() / "config.yml"

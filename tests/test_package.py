@@ -25,7 +25,7 @@ SCRIPTS: dict[str, str] = PROJECT["scripts"]
 # Dependencies whose import name differs from the name of the distribution.
 IMPORTED_AS = {
     "opencv-python-headless": "cv2", "pillow": "PIL", "pygame-ce": "pygame", "pyyaml": "yaml",
-    "pillow-heif": "pillow_heif", "scikit-image": "skimage",
+    "lazy-loader": "lazy_loader", "pillow-heif": "pillow_heif", "scikit-image": "skimage",
 }  # fmt: skip
 # Declared without being imported here, each with the reason.
 NOT_IMPORTED: dict[str, str] = {}

@@ -384,7 +384,7 @@ _MISSING: dict[Role, str] = {
 
 
 def read_device_file(
-    path: Path,
+    path: Path | str,
     role: Role,
     size: tuple[int, int],
     model: DeviceKind | None = None,
@@ -397,6 +397,7 @@ def read_device_file(
     which procam-calibration was run; `name` is that of the device in a file with several cameras. Raises UserError with
     file, cause and remedy.
     """
+    path = Path(path)
     entry = chosen_entry(path, role, size, procam_step, name)
     device = _device(path, entry, size)
     if model is not None and role == "projector":

@@ -43,6 +43,8 @@ class ExportConfig:
     """Point cloud to write, of what frames observed, with normals, sigma and views: .ply, or .las with laspy."""
     resolution: int = 512
     """Cells along each side of the scene's box; the time grows with its square."""
+    align: Literal["z-up", "plane"] | None = None
+    """Turn mesh and points: what was up for the cameras becomes +z, or the plane that the object stands on z = 0."""
     target_faces: int | None = None
     """Number of triangles to which the mesh is reduced (quadric decimation); what that changes is measured."""
     texture: int | None = None
@@ -105,6 +107,7 @@ class ExportConfig:
             target_faces=self.target_faces,
             texture=self.texture,
             points=self.points,
+            align=self.align,
             cameras=self.cameras,
             trajectories=self.trajectory,
         )
@@ -112,7 +115,7 @@ class ExportConfig:
 
 _GROUPS = {
     "the surface": ("resolution", "object_only", "largest_component", "keep_unobserved", "fill_holes", "watertight"),
-    "for other programs": ("target_faces", "texture", "points", "cameras", "trajectory"),
+    "for other programs": ("align", "target_faces", "texture", "points", "cameras", "trajectory"),
     "poses": ("poses",),
     "files": ("data", "overwrite"),
 }
@@ -185,6 +188,13 @@ def _contradictions(config: ExportConfig) -> Iterator[str]:
             "--watertight and --keep-unobserved contradict each other\n"
             "    cause:  a closed solid keeps pieces that some frame observed, with what closes them, and no others\n"
             "    remedy: leave one of them out"
+        )
+    others = {"--poses": config.poses, "--cameras": config.cameras, "--trajectory": config.trajectory}
+    for flag in (flag for flag, value in others.items() if config.align is not None and value):
+        yield (
+            f"--align {config.align} and {flag}: poses are written in the scan's axes, in which the mesh would not be\n"
+            "    cause:  --align turns the mesh and the points alone\n"
+            f"    remedy: export {flag} by itself, without --align"
         )
     if config.keep_unobserved and config.fill_holes is not None:
         yield (
@@ -262,6 +272,7 @@ def description(config: ExportConfig, scan: "Scan", exported: "Exported") -> str
     lines = [
         f"{config.output}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {extent} {unit}",
         *_file_unit(config.output, scan.units),
+        *_axes(config),
         *(_solid(exported) if config.watertight else _removed(surface)),
         *_filled(config, surface, unit),
         *_cut(config, surface, unit),
@@ -278,6 +289,8 @@ def description(config: ExportConfig, scan: "Scan", exported: "Exported") -> str
 
 def _next(config: ExportConfig, scan: "Scan", exported: "Exported") -> list[str]:
     """Say how to judge the mesh. It fits the captures only from the poses with which it was trained."""
+    if config.align is not None:
+        return [fitted("to judge the surface with sl-eval, export it without --align: it needs the scan's axes")]
     if config.watertight or config.keep_unobserved:
         flag = "--watertight" if config.watertight else "--keep-unobserved"
         return [fitted(f"to judge the surface with sl-eval, export it without {flag}: it judges what is invented, too")]
@@ -307,6 +320,11 @@ def _file_unit(path: Path, units: str) -> list[str]:
         return [f"  {text}{f' ({note})' if note else ''}"]
     scaled = "" if units == short else f"; scaled from {units}"
     return [f"  written in {word}s{scaled}{f' ({note})' if note else ' (STL states no unit itself)'}"]
+
+
+def _axes(config: ExportConfig) -> list[str]:
+    turned = {"z-up": "up for the cameras is +z", "plane": "it stands on z = 0, about the origin"}
+    return [] if config.align is None else [f"  turned: {turned[config.align]}"]
 
 
 def _solid(exported: "Exported") -> list[str]:

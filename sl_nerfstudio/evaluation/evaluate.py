@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,9 @@ from sl_nerfstudio.evaluation.agreement import (
 from sl_nerfstudio.evaluation.completeness import Completeness, assess_completeness
 from sl_nerfstudio.evaluation.mesh_faults import MeshFault, find_mesh_faults, missed_axes
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.part_alignment import PartAlignment, place_on_part
 from sl_nerfstudio.evaluation.reference import (
+    MeshReference,
     PointReference,
     PoseErrors,
     Reference,
@@ -53,6 +55,7 @@ from sl_nerfstudio.scan import (
 )
 from sl_nerfstudio.scan.document import TRANSFORMS, check_file, read_document
 from sl_nerfstudio.scan.images import ARRAY_DAMAGE
+from sl_nerfstudio.scan.types import UNITS
 
 # Distances between a reconstructed surface and the truth.
 #
@@ -133,6 +136,9 @@ def default_f_distances(size: float) -> tuple[float, ...]:
 # The files that an evaluation reads: mesh, scan, poses, truth or reference, and what is known about the training.
 
 _FEWEST_POINTS = 100
+_ANOTHER_UNIT = 5.0  # ratio of sizes that no part of an object explains if it does not fit
+FILE_UNITS = {".stl": "mm", ".glb": "m"}
+"""Units of mesh files that have one."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +159,7 @@ class EvaluationInputs:
     true_units: str | None = None  # of the truth that is compared with, where its files say
     colour: UInt8[ndarray, "v 3"] | None = None  # sRGB, of the mesh's vertices, if its file has them
     record: ProcessRecord | None = None  # of the captures, if sl-process made the scan
+    placed: PartAlignment | None = None  # of the result on a reference mesh that was given
 
     @property
     def stated_sigma(self) -> list[PoseSigma | None]:
@@ -169,11 +176,18 @@ class EvaluationInputs:
 
 
 def read_inputs(
-    mesh: Path, data: Path, poses: Path | None, reference: Path | None, samples: int, seed: int
+    mesh: Path,
+    data: Path,
+    poses: Path | None,
+    reference: Path | None,
+    samples: int,
+    seed: int,
+    reference_unit: str | None = None,
 ) -> EvaluationInputs:
     """Read everything. `poses` is a transforms.json or its folder; `reference` replaces the mesh in ground_truth/.
 
-    `samples` points with `seed` are spread over a true mesh. Raises UserError for anything missing or faulty.
+    A `reference` mesh, whose lengths are in `reference_unit`, may have any axes: the result is placed on it by its
+    shape. `samples` points with `seed` are spread over a true mesh. Raises UserError for anything missing or faulty.
     """
     scan = read_scan(data)
     result = read_mesh(mesh, scan.units)
@@ -183,13 +197,19 @@ def read_inputs(
     quality, colour, record = read_quality(mesh), read_colour(mesh), scan.root / "processing.json"
     evaluated = scan.poses if path is None else read_refined_poses(path, scan)
     scan = scan if path is None else read_devices(path, scan)
+    if reference is None or reference.suffix.lower() == ".npz":
+        path_of_truth = reference or truth.mesh_path
+        compared, placed = read_reference(path_of_truth, scan, truth.poses or evaluated, samples, seed), None
+    else:
+        compared, placed = read_part(reference, reference_unit, result, scan, evaluated, truth.poses, samples, seed)
     return EvaluationInputs(
         mesh=result,
         scan=scan,
         poses=evaluated,
         true_poses=truth.poses,
-        true_units=truth.units if reference is None else None,
-        reference=read_reference(reference or truth.mesh_path, scan, truth.poses or evaluated, samples, seed),
+        true_units=truth.units if reference is None else reference_unit or FILE_UNITS.get(reference.suffix.lower()),
+        reference=compared,
+        placed=placed,
         poses_path=path,
         pose_sigma=[] if path is None else read_pose_sigmas(path, scan),
         unplaced=[] if path is None else read_unplaced(path, scan),
@@ -229,6 +249,42 @@ def read_reference(path: Path | None, scan: Scan, poses: DevicePoses, samples: i
             "completeness counts all of them",
         )  # fmt: skip
     return mesh_reference(read_mesh(path, scan.units), scan, poses, samples, seed)
+
+
+def read_part(
+    path: Path,
+    unit: str | None,
+    result: Mesh,
+    scan: Scan,
+    poses: DevicePoses,
+    true_poses: DevicePoses | None,
+    samples: int,
+    seed: int,
+) -> tuple[MeshReference, PartAlignment]:
+    """A nominal mesh in any axes, with where `result` lies on it, unless that fits nowhere.
+
+    `unit` is that of the file's lengths; by default the scan's, of .stl millimetres and of .glb metres. Raises
+    UserError if the sizes are those of different units.
+    """
+    of_scan, of_file = UNITS[scan.units], None if unit is None else UNITS[unit]
+    part = read_mesh(path, scan.units if unit is None else "arbitrary")
+    if of_scan and of_file:
+        part = part.mapped(Similarity.scaling(of_file / of_scan))
+    placed = place_on_part(result, part, with_scale=not of_scan, seed=seed)
+    size, size_of_part = (float(np.linalg.norm(np.subtract(*mesh.bounds()))) for mesh in (result, part))
+    if of_scan and not placed.fits and not 1 / _ANOTHER_UNIT < size / size_of_part < _ANOTHER_UNIT:
+        stated = unit or FILE_UNITS.get(path.suffix.lower()) or f"{scan.units}, the scan's unit"
+        raise FileError(
+            path,
+            f"measures {size_of_part:.4g} {scan.units} from corner to corner, and the scan's surface "
+            f"{size:.4g} {scan.units}",
+            f"its lengths are not in {stated}, or the surface is of something else",
+            "state the unit of the file with --reference-unit; cut the object out with sl-export --object-only",
+        )
+    if placed.in_place or not placed.fits:
+        return mesh_reference(part, scan, true_poses or poses, samples, seed), placed
+    seen = mesh_reference(part, scan, poses.mapped(placed.S_part_result), samples, seed)
+    return replace(seen, start=placed.S_part_result), placed
 
 
 def read_points(path: Path) -> Float64[ndarray, "n 3"]:
@@ -360,17 +416,19 @@ def score_alignments(
 ) -> dict[str, SurfaceScore]:
     """Scores after rigid ICP, after ICP with scale, and without any alignment.
 
-    ICP starts from where the result is. With true poses (or others in the reference's world) it starts a second time
+    ICP starts from where the result is; on a reference in other axes only from its place there, and there is no score
+    without alignment. With true poses (or others in the reference's world) it starts a second time
     from the map of the estimated devices onto those, and the better result counts.
     """
     points, _ = surface.sample(samples, seed)
     distances = tuple(f_distances) or default_f_distances(reference.size)
+    start = reference.start if isinstance(reference, MeshReference) else None
     scores = {}
-    for name in ALIGNMENTS:
+    for name in ALIGNMENTS if start is None else ALIGNMENTS[:-1]:
         S = Similarity.identity()
         if name != "none":
             with_scale = name == "similarity"
-            starts = _starts(poses, true_poses, with_scale, points, 1e-6 * surface.diagonal)
+            starts = [start] if start else _starts(poses, true_poses, with_scale, points, 1e-6 * surface.diagonal)
             ends = [reference.align(surface, points, start, with_scale) for start in starts]
             S = min(ends, key=lambda end: end.residual).S_target_source
         scores[name] = score_surface(surface, points, reference, S, distances)

@@ -3,14 +3,17 @@
 import math
 import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Literal
 
 from sl_nerfstudio.console import figure, unit_word
 from sl_nerfstudio.evaluation.agreement import FrameAgreement
 from sl_nerfstudio.evaluation.completeness import Completeness, NextView
 from sl_nerfstudio.evaluation.evaluate import Evaluation, Length, SurfaceScore
+from sl_nerfstudio.evaluation.inspection import Inspection
+from sl_nerfstudio.evaluation.part_alignment import PartAlignment
 from sl_nerfstudio.evaluation.reference import DeviceErrors, MeshReference, PoseErrors
+from sl_nerfstudio.evaluation.shape_fits import FittedShape
 from sl_nerfstudio.review.verdict import (
     Band,
     DepartedFrame,
@@ -508,15 +511,22 @@ def _sentence(band: Band, evaluation: Evaluation) -> str:
 
 
 def to_json(
-    evaluation: Evaluation, verdict: Verdict, capture: NextView | None = None, lengths: Sequence[Length] = ()
+    evaluation: Evaluation,
+    verdict: Verdict,
+    capture: NextView | None = None,
+    lengths: Sequence[Length] = (),
+    inspection: Inspection | None = None,
+    placed: PartAlignment | None = None,
+    fits: Sequence[FittedShape] = (),
 ) -> dict[str, Any]:
     """A plain dict for `json.dump`; figures that do not exist are null, blocks that do not exist are absent.
 
     `rigid`, `similarity` and `none` hold the distances under each alignment; `camera` and `projector` the
     errors of the evaluated poses and `initial` those of the scan's own, all in `truth_units`. `fit`, the agreement with
     the captures, is always there, and so are `verdict` and `reasons`. `coverage` says what the surface lacks and what
-    to capture next; `cross_frame` is the agreement of the frames with each other, `lengths` are the distances that were
-    asked for.
+    to capture next; `cross_frame` is the agreement of the frames with each other, `lengths` and `fits` are the
+    distances and shapes that were asked for. `inspection` has the deviations from a nominal part, `part` where the
+    surface lies on it and what its shape leaves open.
     """
     out: dict[str, Any] = {
         "format": 1,
@@ -541,7 +551,34 @@ def to_json(
         out["cross_frame"] = {key: value for key, value in asdict(evaluation.cross).items() if key != "pairs"}
     if lengths:
         out["lengths"] = [asdict(length) for length in lengths]
+    if inspection is not None:
+        out["inspection"] = _inspection(inspection)
+    if placed is not None:
+        out["part"] = _placed(placed)
+    if fits:
+        out["fits"] = [asdict(fit) for fit in fits]
     return _finite(out)
+
+
+def _inspection(found: Inspection) -> dict[str, Any]:
+    """Everything but the arrays of the vertices."""
+    plain = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in ("deviation", "sigma", "patches")}
+    plain["S_part_mesh"] = found.S_part_mesh.matrix().tolist()
+    return {**plain, "patches": [asdict(patch) for patch in found.patches]}
+
+
+def _placed(found: PartAlignment) -> dict[str, Any]:
+    motions = found.open_motions
+    return {
+        "fits": found.fits,
+        "in_place": found.in_place,
+        "rms_of_nearest_80_percent": found.rms,
+        "rms_at_next_place": found.next_rms,
+        "open_turns": motions.turns.tolist(),
+        "open_shifts": motions.shifts.tolist(),
+        "open_turns_about": motions.point.tolist() if len(motions.turns) else None,
+        "equal_turns": [R.tolist() for R in found.equal_turns],
+    }
 
 
 def _coverage(found: Completeness) -> dict[str, Any]:

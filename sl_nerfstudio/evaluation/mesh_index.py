@@ -199,6 +199,12 @@ class IndexedMesh:
         """Distance of each point from the surface."""
         return self.closest(points).distance
 
+    def signed_distance(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
+        """Distance of each point from the surface, negative behind it (inside the object)."""
+        near = self.closest(points)
+        behind = ((points - near.point) * near.normal).sum(1) < 0
+        return np.where(behind, -near.distance, near.distance)
+
     def cast(self, origins: Float[ndarray, "n 3"], directions: Float[ndarray, "n 3"]) -> RayHits:
         """What rays with unit `directions` hit first."""
         answer = self._scene.cast_rays(self._rays(origins, directions))

@@ -9,7 +9,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.mesh_index import IndexedMesh, observable
+from sl_nerfstudio.evaluation.mesh_index import Closest, IndexedMesh, observable
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, log_so3
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Scan
@@ -73,9 +73,7 @@ def icp(
     for _ in range(max_iterations):
         moved = S.points(points)
         near = target.closest(moved)
-        weights = _tukey(near.distance, floor=1e-9 * target.diagonal)
-        step = _gauss_newton_step(moved, near.point, near.normal, weights, with_scale)
-        proposed = step @ S
+        proposed = icp_step(moved, near, target, with_scale) @ S
         bounded = float(np.clip(np.log(proposed.scale / start.scale), -_MAX_LOG_SCALE, _MAX_LOG_SCALE))
         S = Similarity(start.scale * float(np.exp(bounded)), proposed.R, proposed.t)
         change = np.abs(S.points(points) - moved).max()
@@ -84,6 +82,12 @@ def icp(
     final = np.sort(target.distance(S.points(points)))
     best = final[: max(1, int(0.8 * len(final)))]
     return Alignment(S, float(np.sqrt((best**2).mean())))
+
+
+def icp_step(points: Float[ndarray, "n 3"], near: Closest, target: IndexedMesh, with_scale: bool) -> Similarity:
+    """One step of `icp`: the motion of points whose nearest points on the target are `near`."""
+    weights = _tukey(near.distance, floor=1e-9 * target.diagonal)
+    return _gauss_newton_step(points, near.point, near.normal, weights, with_scale)
 
 
 def _tukey(distance: Float[ndarray, "n"], floor: float) -> Float[ndarray, "n"]:
@@ -200,6 +204,7 @@ class MeshReference:
     surface: IndexedMesh
     observed: Float[ndarray, "m 3"]
     description: str
+    start: Similarity | None = None  # where the result lies on it, if that is not where it is in the world
 
     @property
     def size(self) -> float:
@@ -210,17 +215,11 @@ class MeshReference:
         """Distance from the nearest point on the triangles, observed or not."""
         return self.surface.distance(points)
 
-    def signed_distance(self, points: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-        """Distance from the nearest point on the triangles, negative behind it (inside the object)."""
-        near = self.surface.closest(points)
-        behind = ((points - near.point) * near.normal).sum(1) < 0
-        return np.where(behind, -near.distance, near.distance)
-
     def surface_errors(
         self, result: IndexedMesh, S_truth_result: Similarity, points: Float[ndarray, "n 3"]
     ) -> Float[ndarray, "n"]:
         """Signed distances, for colours, of `points` on the result (in the frame of the result) from the truth."""
-        return self.signed_distance(S_truth_result.points(points))
+        return self.surface.signed_distance(S_truth_result.points(points))
 
     def align(
         self, result: IndexedMesh, samples: Float[ndarray, "n 3"], start: Similarity, with_scale: bool

@@ -8,6 +8,7 @@ import io
 import json
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ def file_from_world(suffix: str, units: str) -> Similarity:
 
 # PLY files with properties of vertices: what a mesh is worth at each of its vertices.
 
+_FACES = "element face {}\nproperty list uchar int vertex_indices"
 _TYPES = {"double": "<f8", "float": "<f4", "int": "<i4", "ushort": "<u2", "uchar": "u1"}  # not all programs read ushort
 
 
@@ -52,17 +54,42 @@ def encode_ply(mesh: Mesh, properties: VertexProperties | None = None, unit: str
     `unit` is said in a comment of the header.
     """
     columns = _columns(mesh.vertices, mesh.vertex_normals(), properties)
-    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
-    faces["count"], faces["corner"] = 3, mesh.faces
-    element = [f"element face {len(mesh.faces)}", "property list uchar int vertex_indices"]
-    return _encode(columns, unit, element) + faces.tobytes()
+    return _encode(columns, _unit_note(unit), [_FACES.format(len(mesh.faces))]) + _encode_faces(mesh)
 
 
 def encode_points(
     points: Float64[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], properties: VertexProperties, unit: str
 ) -> bytes:
     """A binary PLY of points without triangles, with the same properties."""
-    return _encode(_columns(points, normals, properties), unit, [])
+    return _encode(_columns(points, normals, properties), _unit_note(unit), [])
+
+
+def _unit_note(unit: str) -> list[str]:
+    return [f"lengths in {unit}"] if unit else []
+
+
+DEVIATIONS = "deviations from"
+"""How the first comment of a PLY with deviations begins."""
+
+
+def encode_deviations(
+    mesh: Mesh,
+    deviation: Float64[ndarray, "v"],
+    sigma: Float64[ndarray, "v"],
+    colour: UInt8[ndarray, "v 3"],
+    notes: Sequence[str],
+) -> bytes:
+    """A binary PLY with `deviation` and `sigma` of every vertex; `notes` are comments: unit, axes, legend."""
+    columns = _columns(mesh.vertices, mesh.vertex_normals(), None)
+    columns |= {name: ("uchar", colour[:, k]) for k, name in enumerate(("red", "green", "blue"))}
+    columns |= {"deviation": ("float", deviation), "sigma": ("float", sigma)}
+    return _encode(columns, notes, [_FACES.format(len(mesh.faces))]) + _encode_faces(mesh)
+
+
+def _encode_faces(mesh: Mesh) -> bytes:
+    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
+    faces["count"], faces["corner"] = 3, mesh.faces
+    return faces.tobytes()
 
 
 def _columns(
@@ -85,15 +112,15 @@ def _columns(
     }
 
 
-def _encode(columns: dict[str, tuple[str, ndarray]], unit: str, element: list[str]) -> bytes:
-    """Header and vertices; `element` are the header's lines of what follows them."""
+def _encode(columns: dict[str, tuple[str, ndarray]], notes: Sequence[str], element: list[str]) -> bytes:
+    """Header and vertices; `notes` are comments, `element` the header's lines of what follows the vertices."""
     rows = np.empty(len(columns["x"][1]), dtype=[(name, _TYPES[kind]) for name, (kind, _) in columns.items()])
     for name, (_, values) in columns.items():
         rows[name] = values
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        *([f"comment lengths in {unit}"] if unit else []),
+        *(f"comment {note}" for note in notes),
         f"element vertex {len(rows)}",
         *(f"property {kind} {name}" for name, (kind, _) in columns.items()),
         *element,
@@ -102,7 +129,7 @@ def _encode(columns: dict[str, tuple[str, ndarray]], unit: str, element: list[st
     return "\n".join(header).encode("ascii") + rows.tobytes()
 
 
-def read_quality(path: Path) -> VertexQuality | None:
+def read_quality(path: Path | str) -> VertexQuality | None:
     """Read what `encode_ply` wrote with a mesh; None for any other file."""
     rows = _read_rows(path)
     if rows is None or not {"sigma", "views"} <= set(rows.dtype.names or ()):
@@ -120,7 +147,7 @@ def read_quality(path: Path) -> VertexQuality | None:
     )
 
 
-def read_colour(path: Path) -> UInt8[ndarray, "v 3"] | None:
+def read_colour(path: Path | str) -> UInt8[ndarray, "v 3"] | None:
     """The colours of the vertices of a PLY file, as `encode_ply` writes them; None for any other file."""
     rows, names = _read_rows(path), ("red", "green", "blue")
     if rows is None or any(rows.dtype.fields.get(name, (None,))[0] != np.uint8 for name in names):
@@ -128,9 +155,9 @@ def read_colour(path: Path) -> UInt8[ndarray, "v 3"] | None:
     return np.stack([rows[name] for name in names], 1)
 
 
-def _read_rows(path: Path) -> ndarray | None:
+def _read_rows(path: Path | str) -> ndarray | None:
     """The vertices of a binary PLY file, one row each; None for any other file."""
-    with path.open("rb") as stream:
+    with Path(path).open("rb") as stream:
         if stream.read(3) != b"ply":
             return None
         head, mark, _ = (b"ply" + stream.read(65536)).partition(b"end_header\n")
@@ -408,7 +435,7 @@ def files_of(path: Path, textured: bool = False) -> tuple[Path, ...]:
 
 
 def write_mesh(
-    path: Path,
+    path: Path | str,
     mesh: Mesh,
     properties: VertexProperties | None = None,
     units: str = "arbitrary",
@@ -422,6 +449,7 @@ def write_mesh(
     with y up: see `file_from_world`. Raises UserError for an unknown suffix, a mesh without triangles, a vertex that is
     not a number, or a place where writing is impossible; ValueError for a texture where the format has none.
     """
+    path = Path(path)
     suffix = check_suffix(path)
     if texture is not None and suffix not in TEXTURE_SUFFIXES:
         raise ValueError(f"{suffix} files have no texture")
@@ -453,7 +481,7 @@ def write_mesh(
         write_atomic(path, encode_glb(placed, colour, texture))
 
 
-def read_mesh(path: Path, units: str = "arbitrary") -> Mesh:
+def read_mesh(path: Path | str, units: str = "arbitrary") -> Mesh:
     """Read the triangles of a mesh file, all parts of it in one; polygons are cut into triangles.
 
     GLB, which is in metres with y up, and STL, in millimetres, are taken into a world with z up whose lengths are in
@@ -462,6 +490,7 @@ def read_mesh(path: Path, units: str = "arbitrary") -> Mesh:
     not share them. Raises UserError if the file is missing, empty, damaged, too large, without triangles, refers to
     vertices that do not exist, or holds values that are not numbers.
     """
+    path = Path(path)
     suffix = check_suffix(path)
     check_file(path)
     try:

@@ -80,11 +80,15 @@ class SLTrainerConfig(TrainerConfig):
         if self.machine.num_devices * self.machine.num_machines == 1:
             INTERRUPTION.install()
         try:
-            self._take_folder(self._continue() if self.last_step is not None else self.prepare())
+            self.begin()
         except UserError as error:
             INTERRUPTION.remove()
             print(f"error: {error}", file=sys.stderr)
             raise SystemExit(1) from None
+
+    def begin(self) -> None:
+        """Check everything, complete the settings, and take the run's folder. Raises UserError."""
+        self._take_folder(self._continue() if self.last_step is not None else self.prepare())
 
     def prepare(self) -> Checkpoint | None:
         """Check scan, device and checkpoint; make paths absolute; set intrinsics and the length of the schedules.

@@ -96,11 +96,12 @@ LAYOUTS: dict[str, type[PatternLayout]] = {
 """Every kind of pattern that pattern.json can describe."""
 
 
-def read_layout(path: Path) -> PatternLayout:
+def read_layout(path: Path | str) -> PatternLayout:
     """The pattern that a pattern.json describes, which must be what sl-pattern makes of its own parameters.
 
     Raises UserError that names file and field.
     """
+    path = Path(path)
     document = _read_document(path)
     try:
         return LAYOUTS[document["kind"]].from_document(document)

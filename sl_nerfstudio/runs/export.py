@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 from numpy import ndarray
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, SelfCalibration
@@ -51,7 +52,7 @@ from sl_nerfstudio.runs.cameras import (
     require_possible,
     surface_tracks,
 )
-from sl_nerfstudio.runs.export_settings import BLENDER_FILE, COLMAP_FOLDER, ExportSettings
+from sl_nerfstudio.runs.export_settings import BLENDER_FILE, COLMAP_FOLDER, ExportSettings, Standing
 from sl_nerfstudio.runs.run import TrainedModel, TrainedRun
 from sl_nerfstudio.scan import FileError, PoseSigma, Scan, write_transforms
 from sl_nerfstudio.scan.document import TRANSFORMS
@@ -367,6 +368,51 @@ def _pieces_with(mesh: Mesh, chosen: Bool[ndarray, "f"]) -> Bool[ndarray, "f"]:
     return np.bincount(piece, chosen.astype(float))[piece] > 0
 
 
+# How the surface stands in a file for a program in which z is up.
+
+_LEAST_UP = 0.3  # length of the mean of the cameras' up directions, below which they show none
+
+
+def standing(align: Standing | None, mesh: Mesh, scan: Scan, poses: DevicePoses) -> Similarity:
+    """The map from the scan's axes to those of the files of an export.
+
+    `z-up` turns what was up for the cameras to +z and leaves the origin; `plane` puts the plane that the object stands
+    on at z = 0, the object above it, about the origin. Raises UserError where there is no such direction or plane.
+    """
+    if align is None:
+        return Similarity.identity()
+    up = np.nanmean(poses.T_world_camera[:, :3, 1], axis=0)
+    if align == "z-up":
+        if np.linalg.norm(up) < _LEAST_UP:
+            raise UserError(
+                "--align z-up: the cameras agree on no direction that is up\n"
+                "    cause:  they were turned about their lines of sight, or look down from all sides\n"
+                "    remedy: give --align plane, or leave --align out"
+            )
+        return Similarity(1.0, _turned_to_z(up), np.zeros(3))
+    below = [one.finding.plane for one in separate_scan(scan, poses).surroundings]
+    plane = max(below, key=lambda one: float(one.normal @ up), default=None)
+    if plane is None or plane.normal @ up < _LEAST_UP * np.linalg.norm(up):  # others are walls
+        raise UserError(
+            "--align plane: no plane was found on which the object stands\n"
+            "    cause:  the captures show no table, or it was left out of the scan by --object-only or a mask\n"
+            "    remedy: give --align z-up, or leave --align out"
+        )
+    R = _turned_to_z(plane.normal)
+    low, high = mesh.mapped(Similarity(1.0, R, np.zeros(3))).bounds()
+    x, y = (low + high)[:2] / 2
+    return Similarity(1.0, R, np.array([-x, -y, -plane.offset]))
+
+
+def _turned_to_z(up: Float[ndarray, "3"]) -> Float[ndarray, "3 3"]:
+    """The shortest rotation that turns a direction to +z."""
+    up, z = up / np.linalg.norm(up), np.array([0.0, 0.0, 1.0])
+    if up[2] < -1 + 1e-12:
+        return np.diag([1.0, -1.0, -1.0])
+    axis = np.cross(up, z)
+    return Rotation.from_rotvec(axis / max(np.linalg.norm(axis), 1e-300) * np.arccos(min(up[2], 1.0))).as_matrix()
+
+
 _ROUNDING = 1e-6  # of single precision, relative to the largest number
 
 
@@ -410,9 +456,9 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     colours = None if pictures is None else pictures.colours(mesh.vertices, mesh.vertex_normals())
     invented = quality.views == 0 if settings.keep_unobserved else surface.marked.invented
     properties = VertexProperties(quality, invented, None if colours is None else colours.rgb)
-    points = 0
+    points, S_file_world = 0, standing(settings.align, mesh, scan, poses)
     if settings.points is not None:
-        points = write_points(settings.points, *observed_points(mesh, properties), scan.units)
+        points = write_points(settings.points, *observed_points(mesh.mapped(S_file_world), properties), scan.units)
     if settings.cameras or settings.trajectories:
         write_device_files(settings, model, mesh, properties.colour)
     whole, decimated, textured = mesh, None, None
@@ -425,6 +471,7 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     if settings.texture is not None and pictures is not None:
         with phase("laying the mesh out flat"):
             textured = surface_texture(mesh, settings.texture, whole, pictures)
+    mesh = mesh.mapped(S_file_world)
     write_mesh(settings.mesh, mesh, properties, scan.units, None if textured is None else textured.texture)
     if settings.pose_folder is not None:
         _write_poses(settings.pose_folder / TRANSFORMS, model)

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+Standing = Literal["z-up", "plane"]
 CameraKind = Literal["colmap", "blender"]
 TrajectoryKind = Literal["tum", "kitti"]
 COLMAP_FOLDER = "colmap"
@@ -26,6 +27,7 @@ class ExportSettings:
     target_faces: int | None = None
     texture: int | None = None  # side of the texture in pixels
     points: Path | None = None  # point cloud of what was observed
+    align: Standing | None = None  # how mesh and points are turned; None: they have the scan's axes
     cameras: tuple[CameraKind, ...] = ()
     trajectories: tuple[TrajectoryKind, ...] = ()
 

@@ -253,7 +253,7 @@ class TrainedRun:
     step: int
 
 
-def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
+def load_run(config_path: Path | str, data: Path | None = None) -> TrainedRun:
     """Load the last checkpoint of the run that `config_path` (config.yml) describes.
 
     nerfstudio's own `eval_setup` fails with assertions or tracebacks if files were moved or truncated. Here a run whose
@@ -265,7 +265,7 @@ def load_run(config_path: Path, data: Path | None = None) -> TrainedRun:
         from sl_nerfstudio.dataparser.dataparser import load_scan
         from sl_nerfstudio.model.pipeline import SLPipeline, require_together
 
-    path = config_file(config_path)
+    path = config_file(Path(config_path))
     config: Any = read_config(path)
     checkpoint = read_checkpoint(last_checkpoint(config, path))
     if checkpoint.step < 0:

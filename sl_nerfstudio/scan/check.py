@@ -471,9 +471,9 @@ def _contents(
             faults.take(some)
 
 
-def check_scan(root: Path) -> list[Fault]:
+def check_scan(root: Path | str) -> list[Fault]:
     """All faults of a scan folder; empty if it is good."""
-    return list(check_folder(root).faults)
+    return list(check_folder(Path(root)).faults)
 
 
 def require_valid(root: Path) -> Scan:

@@ -519,7 +519,7 @@ def _wrong_size(found: tuple[int, int], wanted: tuple[int, int], device: str) ->
     )
 
 
-def read_scan(root: Path, need_coords: bool = True) -> Scan:
+def read_scan(root: Path | str, need_coords: bool = True) -> Scan:
     """The scan in a folder, after quick checks: transforms.json, paths, poses and the headers of all files.
 
     No pixel is decoded. `need_coords=False` accepts frames that were not decoded yet. Raises ScanError with all

@@ -48,7 +48,7 @@ class ScanWriter:
 
     def __init__(
         self,
-        root: Path,
+        root: Path | str,
         *,
         units: str,
         scale: Scale,
@@ -72,7 +72,7 @@ class ScanWriter:
             raise ValueError("a camera cannot be a DOE")
         if pattern.shape != (projector.h, projector.w):
             raise ValueError(f"the pattern is {pattern.shape}, the projector {(projector.h, projector.w)}")
-        self.root = root
+        self.root = root = Path(root)
         self._camera = camera
         self._projector = projector
         self._head: dict[str, Any] = {

@@ -14,11 +14,13 @@ from sl_nerfstudio.cli.evaluate import EvalConfig, evaluate_scan, main
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.files import read_mesh, write_mesh
-from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties
 from sl_nerfstudio.scan import read_scan, write_transforms
 from sl_nerfstudio.storage import held_results
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
+from tests.evaluation.faceted_scan import FacetedScan
+from tests.evaluation.test_inspection import PLACE, quality, wrong_bracket
 
 from .snapshots import expect, expect_refusals, masked
 
@@ -167,6 +169,33 @@ def test_reference_mesh_takes_the_place_of_the_truth(scan: Path, tmp_path: Path)
     assert content["rigid"]["accuracy"]["rmse"] < 1e-3
     assert content["rigid"]["matrix"][2][3] == pytest.approx(0.7, abs=1e-3)
     assert 0.3 < content["none"]["accuracy"]["p95"] <= 0.7 + 1e-6
+
+
+@pytest.mark.slow
+def test_a_part_in_other_axes_is_inspected(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """A bracket with a plateau of 0.2 mm, scanned in metres and turned, against its STL in millimetres."""
+    part, mesh, S = wrong_bracket(1e-3)
+    turned = part.mapped(S.inverse())
+    scan = FacetedScan(units="m", with_truth=False, scale=0.04, mesh=Mesh(
+        (turned.vertices - mesh.vertices.mean(0)) / 0.04, turned.faces)).write(tmp_path / "scan")  # fmt: skip
+    mesh = Mesh(mesh.vertices - mesh.vertices.mean(0), mesh.faces)
+    properties = VertexProperties(quality(mesh, 2e-5), np.zeros(len(mesh.vertices), bool))
+    write_mesh(tmp_path / "mesh.ply", mesh, properties, "m")
+    write_mesh(tmp_path / "part.stl", part, units="m")
+    given = ("--mesh", tmp_path / "mesh.ply", "--data", scan, "--reference", tmp_path / "part.stl", "--samples", "5000")
+    out, coloured, page = (tmp_path / name for name in ("out.json", "deviations.ply", "report.html"))
+    run(*given, "--tolerance", "0.1 mm", "--json", out, "--deviations", coloured, "--report", page)
+    content, printed = json.loads(out.read_text()), capsys.readouterr().out
+    assert content["part"]["fits"] and not content["part"]["in_place"] and "none" not in content
+    (patch,) = content["inspection"]["patches"]
+    assert patch["mean"] == pytest.approx(2e-4, abs=2e-5)
+    np.testing.assert_allclose(patch["place"], PLACE / 1000, atol=0.0065)
+    assert "placed on part.stl by its shape" in printed and "±0.1 mm" in printed and "+0.2" in printed
+    assert b"colours: blue -0.0002 or less" in coloured.read_bytes()[:1000] and "out of tolerance" in page.read_text()
+    np.testing.assert_allclose(read_mesh(coloured).bounds(), [[0, 0, 0], [0.06, 0.04, 0.03]], atol=2e-4)
+    assert "measures 78.1 m from corner to corner" in failure(*given, "--reference-unit", "m")
+    assert "--tolerance 0.1: 0.1 has no unit" in failure(*given, "--tolerance", "0.1")
+    assert "there is no nominal surface" in failure(*given[:4], "--tolerance", "0.1 mm")
 
 
 def test_what_cannot_be_evaluated_is_named_and_nothing_is_written(

@@ -296,3 +296,5 @@ def test_flags_that_cannot_be_are_all_named_before_anything_slow(tmp_path, monke
     for flags in ({"output": Path("old.ply"), "overwrite": True}, {"output": Path("mesh.glb"), "texture": 64}):
         check_outputs(ExportConfig(Path("c"), **flags))
     check_outputs(ExportConfig(Path("c"), Path("new/deep/er.ply"), poses=Path("elsewhere/transforms.json")))
+    with pytest.raises(UserError, match=r"--align plane and --poses: [\s\S]*remedy: export --poses by itself"):
+        check_outputs(ExportConfig(Path("c"), Path("new.ply"), align="plane", poses=Path("elsewhere")))

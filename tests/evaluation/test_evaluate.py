@@ -213,7 +213,7 @@ def test_reference_points_are_compared_and_aligned_too() -> None:
 def test_signed_distance_is_negative_inside() -> None:
     reference = whole(IndexedMesh(sphere(10.0, 100)))
     np.testing.assert_allclose(
-        reference.signed_distance(np.array([[0, 0, 11.0], [0, 0, 9.0], [9.5, 0, 0]])), [1, -1, -0.5], atol=0.01
+        reference.surface.signed_distance(np.array([[0, 0, 11.0], [0, 0, 9.0], [9.5, 0, 0]])), [1, -1, -0.5], atol=0.01
     )
 
 

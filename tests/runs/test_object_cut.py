@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.meshing.finish import MarkedMesh
 from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties, VertexQuality
+from sl_nerfstudio.object_separation.planes import Plane
 from sl_nerfstudio.object_separation.separate import Separation
 from sl_nerfstudio.runs.export import (
     Exported,
@@ -22,6 +24,7 @@ from sl_nerfstudio.runs.export import (
     cut_object,
     planes_below,
     separate_scan,
+    standing,
 )
 from sl_nerfstudio.runs.export_settings import ExportSettings
 from sl_nerfstudio.scan import Scan
@@ -84,6 +87,25 @@ def test_the_planes_below_the_object_are_the_same_in_the_scene(found):
     above = S.points(points) @ normal - offset
     np.testing.assert_allclose(above, S.scale * (one.finding.plane.heights(points) - one.tolerance), atol=1e-9)
     assert abs(one.finding.plane.normal[2]) > 0.9999 and 0 < one.tolerance < 2
+
+
+@pytest.mark.parametrize("align", ["plane", "z-up"])
+def test_a_tilted_world_stands_upright(scan, found, monkeypatch, align):
+    """The table at z = 0 and the ball above the origin; or only what was up for the cameras."""
+    tilt = Similarity(1.0, Rotation.from_rotvec([2.0, -0.5, 0.2]).as_matrix(), np.array([100.0, 20.0, -30.0]))
+    plane = found.surroundings[0].finding.plane
+    normal = tilt.R @ plane.normal
+    moved = SimpleNamespace(plane=Plane(normal, plane.offset + float(normal @ tilt.t)))
+    tilted = SimpleNamespace(surroundings=[SimpleNamespace(finding=moved)])
+    monkeypatch.setattr("sl_nerfstudio.runs.export.separate_scan", lambda *_: tilted)
+    S = standing(align, _mesh(BALL).mapped(tilt), scan, scan.poses.mapped(tilt)) @ tilt
+    np.testing.assert_allclose(S.R[2], [0, 0, 1], atol=1e-2)  # what was up is up again
+    if align == "plane":
+        np.testing.assert_allclose(S.points(np.zeros(3)), [0, 0, RADIUS], atol=0.1)
+    tilted.surroundings.clear()
+    if align == "plane":
+        with pytest.raises(UserError, match=r"--align plane: no plane was found[\s\S]*remedy: give --align z-up"):
+            standing(align, _mesh(BALL), scan, scan.poses)
 
 
 class BallOnTable(BallModel):

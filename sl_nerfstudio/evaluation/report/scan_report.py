@@ -23,6 +23,7 @@ from sl_nerfstudio.evaluation.report.capture_reports import captures_of
 from sl_nerfstudio.evaluation.report.charts import (
     NO_SURFACE,
     NO_VALUE,
+    ColourLayer,
     ColourScale,
     camera_views,
     colour_layers,
@@ -192,6 +193,7 @@ class ReportInput:
     mesh_name: str
     made_at: datetime = field(default_factory=datetime.now)
     lengths: Sequence[Length] = ()
+    layers: Sequence[ColourLayer] = ()  # of the surface, besides those of every report
 
     @property
     def poses_name(self) -> str:
@@ -283,7 +285,7 @@ def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[Surfac
     colours = None if values is None or scale is None else scale(values)
     views = camera_views(report.inputs.poses.T_world_camera, surface.centre)
     units = report.evaluation.truth_units
-    layers = colour_layers(values, scale, report.inputs.quality, report.evaluation.units, units)
+    layers = [*colour_layers(values, scale, report.inputs.quality, report.evaluation.units, units), *report.layers]
     quality = report.inputs.quality
     sigma = None if quality is None else quality.sigma
     scan, record = report.inputs.scan, report.inputs.record
