@@ -23,6 +23,7 @@ MOST_TURNS = 16  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
 LEAST_GAIN = 1.0  # nats by which a block must fit better elsewhere to be moved
 MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
+LEAST_SIDE_DEG = 20.0  # between two sides of an object
 STARTS = 24  # frames from which a block is grown
 
 
@@ -53,6 +54,11 @@ class Turn:
     alike: bool  # the surface looks the same after it
     by_surface: Float64[ndarray, "n n"]
     by_order: Float64[ndarray, "n n"]
+
+    @property
+    def to_another_side(self) -> bool:
+        """Whether the order of capture may decide it: smaller turns are slides along a surface."""
+        return angle_deg(self.S_world_world.R) >= LEAST_SIDE_DEG
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,7 @@ class BlockReview:
             {k: S for k, S in self.nodes.items() if k not in out},
             tuple(open_),
             sum(len(block.nodes) for block in without) > len(out),
-            _distinct(sorted(block.turn_deg for block in without)),
+            _distinct(sorted(block.turn_deg for block in without if block.turn_deg >= LEAST_SIDE_DEG)),
         )
 
     def _open(self, turns: Sequence[Turn], with_order: bool) -> list[OpenBlock]:
@@ -104,14 +110,14 @@ class BlockReview:
         while len(left) > 1:
             cuts: list[Cut] = []
             for turn in turns:
-                gain = turn.by_surface + turn.by_order if with_order else turn.by_surface
+                gain = turn.by_surface + turn.by_order if with_order and turn.to_another_side else turn.by_surface
                 part = best_block(gain[np.ix_(left, left)], turn)
                 block = np.zeros(n, dtype=bool)
                 block[left[part.block]] = True
                 cuts.append(Cut(part.gain, block, turn))
             inside = np.isin(np.arange(n), left)
             likely = [cut for cut in sorted(cuts, key=lambda cut: -cut.gain) if cut.gain > -LEAST_ODDS]
-            verified = ((cut, self._verified(cut, inside, with_order)) for cut in likely)
+            verified = ((cut, self._verified(cut, inside, with_order and cut.turn.to_another_side)) for cut in likely)
             cut, gain = next((one for one in verified if one[1] > -LEAST_ODDS), (None, 0.0))
             if cut is None:
                 break

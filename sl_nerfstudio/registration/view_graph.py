@@ -50,10 +50,11 @@ BRIDGED = 4  # components, the largest ones, that are bridged with all others
 BRIDGES = 8  # pairs of frames across two components that are registered in order to join them
 BRIDGES_COMPARED = 40  # pairs across of which those that look most alike are chosen
 BRIDGES_NEARBY = 3  # how many of the bridges are pairs taken one soon after the other
-LEAST_STEPS = 0.5  # share of the successive frames that must fit each other for their usual step to be known
+LEAST_STEPS = 0.5  # share of the successive frames that must fit each other, and turn by the usual step, for one
 LEAST_STEP_DEG = 2.0  # of successive frames
-STEPS_DEG = np.geomspace(1.0, 60.0, 60)  # that are compared
-UNUSUAL_DENSITY = 1e-3  # of a turn that is not the usual one, per degree
+STEPS_DEG = np.geomspace(1.0, 100.0, 60)  # that are compared
+LARGEST_STEP_DEG = 40.0  # of someone who walks around an object
+UNUSUAL_DENSITY = 1 / 180  # of a turn that is not the usual one, per degree
 LEAST_SPREAD = 0.3  # of the usual step, relative to it
 LARGEST_GAP = 2  # between frames by which the usual step is learnt
 MOST_BY_ORDER = 25.0  # nats against a place by the order: someone may have walked to the other side
@@ -262,23 +263,19 @@ class ViewGraph:
         return ScanEvidence(frames, common, np.array([np.median(each) if each else 1.0 for each in noise]))
 
     def learn_step(self) -> None:
-        """By how much successive frames usually turn: what makes the places that all their pairs allow most likely."""
+        """By how much successive frames usually turn: what makes the places that all their pairs allow most likely.
+
+        Large turns are those of frames in no order.
+        """
         pairs = [e for e in self.edges if abs(e.target - e.source) <= LARGEST_GAP and e.holds]
         if sum(abs(e.target - e.source) == 1 for e in pairs) <= LEAST_STEPS * (len(self.frames) - 1):
             self.step = None
             return
         steps = [UsualStep(deg, max(LEAST_SPREAD * deg, LEAST_STEP_DEG)) for deg in STEPS_DEG]
-        self.step = max(steps, key=lambda step: sum(self._log_likelihood(e, step) for e in pairs))
-
-    @staticmethod
-    def _log_likelihood(e: PairMatch, step: "UsualStep") -> float:
-        """Of a step, over the places that a pair allows; a few pairs turn by anything."""
-        angle = np.array([angle_deg(e.S_target_source.R), *(angle_deg(r.S_target_source.R) for r in e.rivals)])
-        odds = np.array([0.0, *(r.log_odds for r in e.rivals)])
-        odds = np.exp(odds - odds.max())
-        off = (angle / abs(e.target - e.source) - step.deg) / step.sigma_deg
-        usual = np.exp(-0.5 * off**2) / (step.sigma_deg * math.sqrt(2 * math.pi))
-        return math.log(float(((usual + UNUSUAL_DENSITY) * odds).sum() / odds.sum()))
+        step = max(steps, key=lambda step: sum(math.log(sum(_densities(e, step))) for e in pairs))
+        usual = [_densities(e, step) for e in pairs]
+        share = np.mean([known / (known + unusual) for known, unusual in usual])
+        self.step = step if step.deg <= LARGEST_STEP_DEG and share >= LEAST_STEPS else None
 
     def usual_step(self, i: int, j: int, S_i_j: Similarity) -> float:
         """Log-odds of the place of one frame on another by the order of capture."""
@@ -349,6 +346,16 @@ class ViewGraph:
                     pairs.add((min(i, j), max(i, j)))
         edges = {pair for pair, match in self._tried.items() if match is not None and is_accepted(match)}
         return sorted(pairs - edges)
+
+
+def _densities(e: PairMatch, step: UsualStep) -> tuple[float, float]:
+    """Of the turn of a pair, over the places that it allows: by the usual step, and of a turn by anything."""
+    angle = np.array([angle_deg(e.S_target_source.R), *(angle_deg(r.S_target_source.R) for r in e.rivals)])
+    odds = np.array([0.0, *(r.log_odds for r in e.rivals)])
+    odds = np.exp(odds - odds.max())
+    off = (angle / abs(e.target - e.source) - step.deg) / step.sigma_deg
+    usual = np.exp(-0.5 * off**2) / (step.sigma_deg * math.sqrt(2 * math.pi))
+    return float((usual * odds).sum() / odds.sum()), UNUSUAL_DENSITY
 
 
 def likely_places(match: PairMatch) -> list[Similarity]:
