@@ -185,7 +185,8 @@ def _derivatives(field: SDFField, p: torch.Tensor) -> list[torch.Tensor]:
     p = p.clone().requires_grad_()
     f, slopes = field.sdf_and_last_gradients(p, len(p) * 2 // 3)
     (f.square().sum() + (slopes.norm(dim=-1) - 1).square().sum()).backward()
-    return [x.detach().double().cpu() for x in (f, slopes, p.grad, *(y.grad for y in field.parameters()))]
+    found = (f, slopes, p.grad, *(y.grad for y in field.parameters()))
+    return [x.detach().double().cpu() for x in found if x is not None]
 
 
 def beside_a_busy_thread(config: Config, scan: Path) -> dict[str, Any]:

@@ -96,7 +96,8 @@ def launches_of_a_step(method: str, scan: Path) -> list[Launch]:
             torch.stack(list(terms.values())).sum().backward()
         training.model.cache.refresh(training.model.field)
         state = {"moments": torch.zeros(len(table), 2, 8), "steps": torch.zeros(len(table))}
-        _step_device(table, state, 0.01, *RowAdam([table]).param_groups[0]["betas"], 1e-15)
+        first, second = RowAdam([table]).param_groups[0]["betas"]
+        _step_device(table, state, 0.01, first, second, 1e-15)
     return found
 
 
@@ -104,7 +105,7 @@ def compiled(launches: list[Launch], architecture: int) -> list[Row]:
     """Compile all launches for an architecture."""
     from triton.runtime import driver
 
-    driver.set_active(NoGpu(architecture))
+    driver.set_active(NoGpu(architecture))  # pyright: ignore[reportArgumentType]  # as much of one as compiling needs
     for kernel, *_ in launches:
         kernel.device_caches.clear()  # they hold what was compiled for the last one
     found: dict[str, dict[str, tuple[int, int, int, int]]] = {}

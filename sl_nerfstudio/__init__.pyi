@@ -1,6 +1,8 @@
 # The public names of the package, by topic; `X as X` says that X is meant for others.
 # ruff: noqa: I001
 
+__version__: str
+
 # Faults: a UserError says what is wrong, its likely cause and the remedy.
 from .errors import UserError as UserError
 

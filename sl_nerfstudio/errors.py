@@ -48,7 +48,7 @@ def first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0][:_LONGEST]
 
 
-def last_line(error: Exception) -> str:
+def last_line(error: BaseException) -> str:
     """The last line of what another library says, or the error's kind if it says nothing."""
     return (str(error).strip().splitlines() or [type(error).__name__])[-1].strip()[:_LONGEST]
 

@@ -1,4 +1,4 @@
-# pyright: basic, reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: basic, reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 """The field on a GPU: Triton kernels for the grid and the activations, torch's matrix products between them.
 
 Values of all n points, and gradients of the last k of them, are computed together: few launches, no waits. A point's

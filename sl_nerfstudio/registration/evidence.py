@@ -556,7 +556,8 @@ class Comparison:
     @staticmethod
     def none(count: int) -> "Comparison":
         """Places of which nothing is known."""
-        return Comparison(*np.zeros((2, count, count)), np.zeros(count), np.zeros((count, count), dtype=bool))
+        shared, own = np.zeros((2, count, count))
+        return Comparison(shared, own, np.zeros(count), np.zeros((count, count), dtype=bool))
 
 
 class PairEvidence:
@@ -597,7 +598,7 @@ class PairEvidence:
         i, j = np.tril_indices(UNKNOWNS, -1)
         H[:, j, i] = H[:, i, j]
         return (
-            Compared(*(np.concatenate(each, 1) for each in (zs, codes, spreads))),
+            Compared(np.concatenate(zs, 1), np.concatenate(codes, 1), np.concatenate(spreads, 1)),
             H / self._mean_area,
             g / self._mean_area,
         )

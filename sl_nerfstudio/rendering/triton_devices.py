@@ -1,4 +1,4 @@
-# pyright: basic, reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: basic, reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 """Poses, projection and pattern in Triton, for tiles of points; the formulas are those of `geometry/devices.py`.
 
 A pose is its rotation's three columns and its translation, each a vector. `k` are the eight PARAMETERS of a device,

@@ -1,4 +1,4 @@
-# pyright: basic, reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: basic, reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 """Kernels in Triton from pixels to the weighted losses, and back; `triton_step.py` launches them.
 
 The formulas are those of `renderer.py`, `volume_rendering.py`, `losses.py` and `direct_losses.py`. The field is

@@ -1,4 +1,4 @@
-# pyright: basic, reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false
+# pyright: basic, reportIndexIssue=false, reportOperatorIssue=false, reportArgumentType=false, reportGeneralTypeIssues=false
 """Poses from the increments to their bases, in Triton and in double precision; the formulas are those of `model/poses`.
 
 Matrices act on columns (x, y, z, h) of a pose, where h is 1 for the translation and 0 for axes: a row of a tile is a

@@ -1,3 +1,4 @@
+# pyright: basic, reportGeneralTypeIssues=false, reportArgumentType=false
 """The losses of a training step on a GPU: a few kernels in Triton around one evaluation of the field.
 
 Numbers and gradients are those of `renderer.py`, `volume_rendering.py`, `losses.py` and `direct_losses.py`, which take

@@ -26,7 +26,7 @@ def of_trimesh(shape: trimesh.Trimesh) -> Mesh:
 
 def scanned(part: Mesh, edge: float = 2.5, noise: float = 0.02, S: Similarity = ANYWHERE, seed: int = 0) -> Mesh:
     """The part with fine triangles, each vertex off by some noise along its normal, anywhere."""
-    vertices, faces = trimesh.remesh.subdivide_to_size(part.vertices, part.faces, edge)
+    vertices, faces, *_ = trimesh.remesh.subdivide_to_size(part.vertices, part.faces, edge)
     fine = Mesh(vertices, faces.astype(np.int64))
     off = np.random.default_rng(seed).normal(0, noise, len(vertices))
     return Mesh(vertices + off[:, None] * fine.vertex_normals(), fine.faces).mapped(S)
