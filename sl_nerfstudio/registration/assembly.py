@@ -20,6 +20,7 @@ from sl_nerfstudio.registration.pairs import (
     LEAST_ODDS,
     SAME_PLACE_DEG,
     SAME_PLACE_SHIFT,
+    TONE_ODDS,
     PairMatch,
     edge_weights,
 )
@@ -169,7 +170,20 @@ class Assembly:
                 first[i].inverse() @ S @ second[j] if see_same_side(first[i], S @ second[j]) else None for S in places
             ]
             found += self._scan.comparison(j, i, here).scaled(2 / (degree[i] + degree[j]))
+        found += self._by_tone(first, second, places)
         return replace(found, alike=found.alike | alike | self._known_alike(first, second, places))
+
+    def _by_tone(self, first: Component, second: Component, places: Sequence[Similarity]) -> Comparison:
+        """What the tones of frames across say, which hold them where surfaces would slip."""
+        across = [e for e in self._between(first, second) if e.by_tone]
+        degree = Counter(k for e in across for k in (e.source, e.target))
+        odds = np.zeros(len(places))
+        for e in across:
+            for k, S in enumerate(places):
+                both = {**first, **{j: S @ one for j, one in second.items() if j in (e.source, e.target)}}
+                if e.log_odds_at(both[e.target].inverse() @ both[e.source]) is not None:
+                    odds[k] += TONE_ODDS * 2 / (degree[e.source] + degree[e.target])
+        return replace(Comparison.none(len(places)), shared=odds[:, None] - odds, odds=odds)
 
     def _known_alike(self, first: Component, second: Component, places: Sequence[Similarity]) -> Bool[ndarray, "k k"]:
         """Between which places the frames of one of the components are known to look the same."""

@@ -16,10 +16,10 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.registration.assembly import Assembly, Prior, looks_alike
-from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_TURN_DEG, PairMatch, edge_weights
+from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_TURN_DEG, TONE_ODDS, PairMatch, edge_weights
 from sl_nerfstudio.registration.pose_graph import Component, Pivots, at_places, optimise_pose_graph
 
-MOST_TURNS = 16  # of the world that are tried
+MOST_TURNS = 48  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
 LEAST_GAIN = 1.0  # nats by which a block must fit better elsewhere to be moved
 MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
@@ -157,7 +157,9 @@ class BlockReview:
             weight = 2 / (self._degree[e.source] + self._degree[e.target])  # see Assembly.compare
             for moved, kept, way in ((i, j, S @ turn), (j, i, S @ inverse)):
                 there = e.log_odds_at(way @ self.nodes[e.source])
-                if not (alike and (here is None or there is None)):  # see Comparison
+                if e.by_tone:
+                    surface[moved, kept] += weight * TONE_ODDS * (float(there is not None) - float(here is not None))
+                elif not (alike and (here is None or there is None)):  # see Comparison
                     before, after = (-MOST_AGAINST if odds is None else odds for odds in (here, there))
                     surface[moved, kept] += weight * (after - before)
         if self._prior is not None:
@@ -196,11 +198,14 @@ def turns_said(edges: Sequence[PairMatch], nodes: Component) -> list[Similarity]
             turn = target @ S @ source
             said += [(odds - here, turn), (odds - here, turn.inverse())]
     found: list[Similarity] = []
+    known = np.tile(np.eye(3), (1 + MOST_TURNS, 1, 1))  # rotations of none, and of those that were found
+    closest = 1 + 2 * np.cos(np.radians(SAME_TURN_DEG))  # trace of a rotation by that angle
     for _, turn in sorted(said, key=lambda one: -one[0]):
         if len(found) == MOST_TURNS:
             break
-        if all(angle_deg(turn.R @ T.R.T) > SAME_TURN_DEG for T in (Similarity.identity(), *found)):
+        if np.einsum("kij,ij->k", known[: 1 + len(found)], turn.R).max() < closest:
             found.append(turn)
+            known[len(found)] = turn.R
     return found
 
 

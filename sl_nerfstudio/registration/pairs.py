@@ -120,6 +120,7 @@ TONE_FEWEST_OTHERS = 12  # places that it must be compared with
 TONE_LEAST_SIGMA_DEG = 0.3  # of a rotation found so
 TONE_LARGEST_SIGMA_DEG = 1.5  # beyond it nothing is found: broad shades are as likely light as surface
 TONE_LARGEST_LOSS = 20.0  # nats by which surfaces may be less likely there
+TONE_ODDS = 20.0  # nats that the place at which tones agree leads others, if other pairs confirm it
 TONE_SIGMAS = 4.0  # of two surfaces within which tones are compared
 
 
@@ -191,7 +192,7 @@ class PairMatch:
 
 def is_accepted(match: PairMatch) -> bool:
     """Whether two frames have a surface in common, wherever it is: what slips fits as well along its whole motion."""
-    return match.log_odds > (0.0 if match.slip_deg else LEAST_ODDS)
+    return match.log_odds > (0.0 if match.slip_deg or match.by_tone else LEAST_ODDS)
 
 
 def is_ambiguous(match: PairMatch) -> bool:
