@@ -32,6 +32,7 @@ _CELLS = (1 / 5, 1 / 3, 1 / 2, 2 / 3)  # of a region's radius: sizes of cells wi
 _SHARED = 300  # vertices whose shared errors are propagated
 _REWEIGHTED = 6  # times
 _TUKEY = 4.685  # of the robust sigma
+_EXACT = 1e-9  # of the region: smaller distances are rounding
 _LARGEST_RADIUS = 50.0  # of the region's radius: what is flatter has no measurable radius
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _REGION = re.compile(rf"\s*(\w+)\s+({_NUMBER},{_NUMBER},{_NUMBER})\s+({_NUMBER})\s*")
@@ -205,8 +206,7 @@ def _fitted(
             state = minimise(state, *_problem(kind, points, weights)).state
             r = _residuals(kind, state, points)[0]
             spread = MAD_TO_SIGMA * float(np.median(np.abs(r)))
-            if not spread > 0:
-                break
+            spread = max(spread, _EXACT * float(np.abs(points - state[:3]).max()))
             weights = np.maximum(1 - (r / (_TUKEY * spread)) ** 2, 0.0) ** 2
         ends.append((float(np.median(np.abs(_residuals(kind, state, points)[0]))), state, weights))
     _, state, weights = min(ends, key=lambda end: end[0])
