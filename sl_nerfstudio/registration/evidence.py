@@ -52,6 +52,7 @@ WRONG_SHARE = 0.01  # of coordinates that are wrong, there
 LARGEST_SPREAD = 8.0  # sigma over that of smooth surface, up to which these shares grow with it
 LARGEST_RESIDUAL = 100.0
 NOISE_QUANTILES = np.array([0.68, 0.95])  # of residuals, by which a pair's are compared with that density
+LARGEST_NOISE = 5.0  # factor: beyond it residuals are no noise, the place is wrong
 NOISE_RESIDUALS = np.array([1.06, 3.2])  # its quantiles there
 USUAL_SIGMAS = 1.0  # of a residual in the right place
 INDISTINCT_SIGMAS = 2.5  # within which residuals say nothing of the place: views that are alike share errors
@@ -460,11 +461,11 @@ class Compared:
         return replace(self, z=self.z[index], codes=self.codes[index], spread=self.spread[index])
 
     def noise(self, k: int, points: slice) -> float:
-        """How much larger the residuals of some points are at a place than stated; at least 1."""
+        """How much larger the residuals of some points are at a place than stated; within limits."""
         size = np.abs(self.z[k, points][self.codes[k, points] == JUDGED])
         if len(size) < FEWEST_JUDGED:
             return 1.0
-        return float(max(1.0, *np.quantile(size, NOISE_QUANTILES) / NOISE_RESIDUALS))
+        return float(np.clip((np.quantile(size, NOISE_QUANTILES) / NOISE_RESIDUALS).max(), 1.0, LARGEST_NOISE))
 
     def scaled(self, noise: Float64[ndarray, "n"]) -> "Compared":
         """Residuals in units of what they are found to be."""

@@ -1,7 +1,7 @@
 """The compiled sums of points against surfaces, against a plain formula and against differences."""
 
 from dataclasses import replace
-from itertools import combinations, permutations
+from itertools import permutations
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
-from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.geometry.triangulation import pixel_centres
 from sl_nerfstudio.registration import agreement as module
 from sl_nerfstudio.registration.agreement import (
@@ -29,8 +29,6 @@ from sl_nerfstudio.registration.agreement import (
     agreement,
     agreement_at,
 )
-from sl_nerfstudio.registration.evidence import Frame
-from sl_nerfstudio.registration.pairs import ANYWHERE, register_pair
 from sl_nerfstudio.registration.surfaces import EmptyPlaces, FrameView, SurfaceMap, build_surface_map, tangent_planes
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, similarities_of
@@ -255,28 +253,3 @@ def test_what_is_larger_than_it_was_seen_is_missed_where_it_is_known_what_was_se
     larger = Similarity(1.3, np.eye(3), np.zeros(3))
     assert min(absent_in_pairs(maps_with_empty_places(box.clouds), box.S_world_camera, larger)) > 0.02
     assert max(absent_in_pairs([build_surface_map(c) for c in box.clouds], box.S_world_camera, larger)) == 0
-
-
-def without_empty_places(cloud):
-    """A frame that does not know where nothing is."""
-    frame = Frame.of(cloud)
-    nothing = replace(frame.evidence.nothing, empty=np.zeros_like(frame.evidence.nothing.empty))
-    return replace(frame, evidence=replace(frame.evidence, nothing=nothing))
-
-
-def test_a_side_of_a_box_does_not_pass_for_another(box):
-    """Wherever faces overlap they agree, at several sides; only where one ends do frames contradict each other."""
-    true = box.S_world_camera
-    blind, seeing = [without_empty_places(c) for c in box.clouds], maps_with_empty_places(box.clouds)
-    right, wrong = [], []
-    for i, j in combinations(range(len(EMPTY_FRAMES)), 2):
-        match = register_pair((blind[i], blind[j]), (i, j), ANYWHERE, np.random.default_rng(0))
-        S = match.S_target_source
-        known = agreement_at((seeing[i], seeing[j]), S, np.random.default_rng(0), Tolerance(0.0, AGREEING_SIGMAS))
-        off_deg = angle_deg(S.R @ (true[j].inverse() @ true[i]).R.T)
-        same = min(off_deg, abs(180 - off_deg)) < 3  # half a turn leaves the box as it is
-        (right if same else wrong).append((match.fitness, known.absent[0]))
-    assert min(len(right), len(wrong)) > 0
-    assert min(fitness for fitness, _ in (*right, *wrong)) > 0.99  # nothing that both saw contradicts
-    assert max(absent for _, absent in right) < 0.01
-    assert min(absent for _, absent in wrong) > 0.02

