@@ -11,7 +11,7 @@ import tyro
 
 from sl_nerfstudio.cli.arguments import SCAN, parse
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import paragraph, phase
+from sl_nerfstudio.console import paragraph, phase, unit_word
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:

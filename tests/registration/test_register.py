@@ -157,8 +157,9 @@ def test_frames_of_a_separate_group_name_it_and_where_to_capture(few):
     assert found.component.tolist() == [0, 0, 0, 1, 1]
     group = tuple(c.name for c in true.clouds)
     for why, name in zip(found.exclusions, group, strict=True):
-        assert isinstance(why, SeparateComponent)
-        assert (why.frame, why.component) == (name, group) and why.partner in (None, *found.names[:3])
+        assert isinstance(why, SeparateComponent | OpenPlace)
+        together = why.component if isinstance(why, SeparateComponent) else why.group
+        assert (why.frame, together) == (name, group) and why.partner in (None, *found.names[:3])
     assert np.isnan(found.fitness[3:]).all() and (found.fitness[:3] > 0.9).all()
     (separate,) = found.separate  # in axes of their own
     assert separate.frames == group

@@ -138,7 +138,7 @@ def test_the_summary_says_what_was_removed_and_why(scan, found):
     surface = ExtractedSurface(marked, None, None, cut, 0, 1.0)
     nothing = VertexQuality(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0))
     properties = VertexProperties(nothing, marked.invented)
-    exported = Exported(marked.mesh, properties, surface, *3 * [None], 0, None, False, 1.0, 1.0)
+    exported = Exported(marked.mesh, properties, surface, *4 * [None], 0, None, False, 1.0)
     text = " ".join(summary(ExportConfig(Path("c"), Path("mesh.ply"), object_only=True), scan, exported).split())
     assert re.search(r"--object-only removed [\d.e+]+ square mm \(9\d% of the surface\) with 1 planes around", text)
     assert "of the points left out: all cameras are in front of it, nothing is behind it" in text
