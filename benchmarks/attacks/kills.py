@@ -1,5 +1,6 @@
 """Commands that are killed or stopped, and two at once: the next one must refuse or succeed with the right result."""
 
+import hashlib
 import random
 import shutil
 import signal

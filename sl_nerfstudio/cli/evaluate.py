@@ -1,6 +1,7 @@
 """sl-eval: compare a mesh and its poses with a scan, and with the truth if it is known."""
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

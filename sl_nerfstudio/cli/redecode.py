@@ -10,7 +10,7 @@ from sl_nerfstudio.console import command, next_steps, phase
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
-    from sl_nerfstudio.redecoding.redecode import Redecoded
+    from sl_nerfstudio.redecoding.redecode import Redecoded, RedecodedFacts
     from sl_nerfstudio.runs.run import TrainedRun
 
 _MOST_NAMED = 6
@@ -85,7 +85,7 @@ def summary(output: Path, method: str, found: "Redecoded") -> str:
     return "\n".join([*lines, next_steps([command("ns-train", method, "--data", output)])])
 
 
-def _left(frames: "list[FrameFacts]") -> list[str]:
+def _left(frames: "list[RedecodedFacts]") -> list[str]:
     """The frames that were left as they are, and why that may be."""
     names = ", ".join(frame.name for frame in frames[:_MOST_NAMED])
     more = f" and {len(frames) - _MOST_NAMED} more" if len(frames) > _MOST_NAMED else ""
