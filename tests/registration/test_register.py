@@ -121,7 +121,7 @@ def test_a_vase_is_put_together_by_its_blotches():
     some = rendered("vase", tuple(range(4, 12)), resolution=240, lit=True)
     bare = register([replace(c, light=None) for c in some.clouds], sequence=True)
     found = register(some.clouds, sequence=True)
-    assert bare.registered.sum() < len(some.frames)
+    assert (~bare.registered).sum() + len(bare.uncertainties) > len(some.frames) / 2  # left out, or said to slip
     assert found.registered.all() and not found.uncertainties
     assert_right_or_named(found, some, 2.0, np.inf)
 
