@@ -42,7 +42,7 @@ def test_round_parts_leave_turns_open_and_a_flat_patch_shifts_too() -> None:
     cylinder = of_trimesh(trimesh.creation.cylinder(15, 50, sections=64))
     found = place_on_part(scanned(cylinder), cylinder)
     np.testing.assert_allclose(np.abs(found.open_motions.turns), [[0, 0, 1]], atol=1e-3)
-    assert np.abs(found.open_motions.point[:2]).max() < 0.01 and not len(found.open_motions.shifts)
+    assert np.abs(found.open_motions.point[:2]).max() < 0.05 and not len(found.open_motions.shifts)
     (end_for_end,) = found.equal_turns
     assert end_for_end[2, 2] == pytest.approx(-1, abs=1e-4)
     sphere = of_trimesh(trimesh.creation.icosphere(3, 20))
