@@ -112,29 +112,35 @@ def _on_surface(place, valid, some):
 
 
 @compiled
+def lit(x, y, z, a, b, c, light, least_cosine):
+    """Whether a point with its normal would be seen, and lit by the projector; `light` see `EmptyPlaces`."""
+    code, projector, T, reach = light
+    if -(a * x + b * y + c * z) < least_cosine * np.sqrt(x * x + y * y + z * z):
+        return False
+    X = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
+    Y = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
+    Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+    A = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c
+    B = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c
+    C = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c
+    distance = np.sqrt(X * X + Y * Y + Z * Z)
+    if least_cosine * distance > -(A * X + B * Y + C * Z):
+        return False
+    column, row, in_front = pixel_of(code, X, Y, Z, projector)
+    if not (in_front and column >= 0 and row >= 0 and column < reach.shape[1] and row < reach.shape[0]):
+        return False
+    return distance < reach[int(row), int(column)]
+
+
+@compiled
 def _absent(mapped, place, empty, light, least_cosine):
     """Count the points that would be seen and lit where the other frame saw nothing; `light` see `EmptyPlaces`."""
-    code, projector, T, reach = light
-    h, w = reach.shape
     count = 0
     for n in range(len(place)):
         if place[n] < 0 or not empty[int(place[n])]:
             continue
         x, y, z, a, b, c = mapped[0, n], mapped[1, n], mapped[2, n], mapped[3, n], mapped[4, n], mapped[5, n]
-        if -(a * x + b * y + c * z) < least_cosine * np.sqrt(x * x + y * y + z * z):
-            continue
-        X = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-        Y = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-        Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-        A = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c
-        B = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c
-        C = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c
-        distance = np.sqrt(X * X + Y * Y + Z * Z)
-        if least_cosine * distance > -(A * X + B * Y + C * Z):
-            continue
-        column, row, in_front = pixel_of(code, X, Y, Z, projector)
-        if in_front and column >= 0 and row >= 0 and column < w and row < h:
-            count += distance < reach[int(row), int(column)]
+        count += lit(x, y, z, a, b, c, light, least_cosine)
     return count
 
 

@@ -22,9 +22,8 @@ from sl_nerfstudio.registration.pairs import (
     SAME_PLACE_SHIFT,
     TONE_ODDS,
     PairMatch,
-    edge_weights,
 )
-from sl_nerfstudio.registration.pose_graph import Component, Pivots, at_places, optimise_pose_graph
+from sl_nerfstudio.registration.pose_graph import Component, Pivots, optimise_at_places
 
 MOST_COMPARED = 12  # clearly different similarities between two components
 MOST_PAIRS = 10  # of frames across two components that are compared
@@ -37,7 +36,6 @@ class Link:
 
     S_first_second: Similarity
     log_odds: float  # of the pair's place against nothing
-    edge: PairMatch
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,6 @@ class Assembly:
         """
         self._scan, self._pivots, self._prior = scan, pivots, prior
         self._edges = sorted(edges, key=lambda e: -e.lead)
-        self._weight = edge_weights(self._edges)
         self._decisions: dict[tuple[int, int], Decision | None] = {}  # by the numbers of two components
         self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(pivots))]
         self._number = list(range(len(pivots)))  # of each frame's component
@@ -119,7 +116,7 @@ class Assembly:
     def _joined(self, first: Component, second: Component, S: Similarity) -> Component:
         """Merge both in the world of the first, with all pairs inside optimised together."""
         both = {**first, **{k: S @ S_second for k, S_second in second.items()}}
-        found = optimise_pose_graph(at_places(self._edges, both), self._pivots, both, self._weight).S_world_camera
+        found = optimise_at_places(self._edges, self._pivots, both).S_world_camera
         return {k: found[k] for k in both}
 
     def decide(self, first: Component, second: Component) -> Similarity | None:
@@ -132,7 +129,7 @@ class Assembly:
         places = self._proposed(first, second)
         if not places:
             return None
-        found = self.compare(first, second, places)
+        found = self.compare(first, second, places, self._known_alike(first, second, places))
         usual = np.array([self.usual(first, second, S) for S in places])
         both = found.leads + usual[:, None] - usual
         best = int(np.argmax(both.min(1)))
@@ -153,13 +150,14 @@ class Assembly:
         return distinct
 
     def compare(
-        self, first: Component, second: Component, places: Sequence[Similarity], alike: bool = False
-    ) -> Comparison:
+        self, first: Component, second: Component, places: Sequence[Similarity],
+        alike: Bool[ndarray, "k k"] | bool = False,
+    ) -> Comparison:  # fmt: skip
         """Compare places by all frames that face each other there.
 
         The errors of a frame are the same in all of its pairs. Where each frame has d pairs across, they count as
-        2 / (d + d') of independent ones. `alike`: the surface looks the same at all places, which frames that face each
-        other at two of them show as well.
+        2 / (d + d') of independent ones. `alike`: at which places the surface is known to look the same (all of
+        them, if True); frames that face each other at two of them show it as well.
         """
         found = Comparison.none(len(places))
         near = [set(facing(first, second, S)) for S in places]
@@ -171,7 +169,7 @@ class Assembly:
             ]
             found += self._scan.comparison(j, i, here).scaled(2 / (degree[i] + degree[j]))
         found += self._by_tone(first, second, places)
-        return replace(found, alike=found.alike | alike | self._known_alike(first, second, places))
+        return replace(found, alike=found.alike | alike)
 
     def _by_tone(self, first: Component, second: Component, places: Sequence[Similarity]) -> Comparison:
         """What the tones of frames across say, which hold them where surfaces would slip."""
@@ -212,11 +210,9 @@ class Assembly:
         """What a pair across says: its best similarity and its rivals."""
         forward = e.source in second
         target, source = (e.target, e.source) if forward else (e.source, e.target)
-        places = [(e.S_target_source, e.log_odds)]
-        places += [(r.S_target_source, e.log_odds + r.log_odds) for r in e.rivals]
+        places = [(one.S_target_source, e.log_odds + one.log_odds) for one in e.places]
         return [
-            Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), odds, e)
-            for S, odds in places
+            Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), odds) for S, odds in places
         ]
 
     def differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
@@ -255,11 +251,6 @@ def facing(first: Component, second: Component, S: Similarity, most: int = MOST_
     return [(here[k // len(there)], there[k % len(there)]) for k in near if cosine[k] > LEAST_SIGHT_COSINE]
 
 
-def _cosine(a: Similarity, b: Similarity) -> float:
-    """Cosine of the angle between the lines of sight of two cameras."""
-    return float(a.R[:, 2] @ b.R[:, 2])
-
-
 def see_same_side(a: Similarity, b: Similarity) -> bool:
     """Whether the lines of sight of two cameras differ little enough to see a common surface."""
-    return _cosine(a, b) > LEAST_SIGHT_COSINE
+    return float(a.R[:, 2] @ b.R[:, 2]) > LEAST_SIGHT_COSINE

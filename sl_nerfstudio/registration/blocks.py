@@ -7,7 +7,7 @@ move to where they are likelier. A block that is nearly as likely elsewhere is n
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +16,8 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.registration.assembly import Assembly, Prior, looks_alike
-from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_TURN_DEG, TONE_ODDS, PairMatch, edge_weights
-from sl_nerfstudio.registration.pose_graph import Component, Pivots, at_places, optimise_pose_graph
+from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_TURN_DEG, TONE_ODDS, PairMatch
+from sl_nerfstudio.registration.pose_graph import Component, Pivots, optimise_at_places
 
 MOST_TURNS = 48  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
@@ -79,7 +79,7 @@ class BlockReview:
         self._assembly, self._pivots, self._prior = assembly, pivots, prior
         self._edges = [e for e in edges if e.source in component and e.target in component]
         self._degree = Counter(k for e in self._edges for k in (e.source, e.target))
-        self.nodes = optimised(self._edges, pivots, component)
+        self.nodes = optimise_at_places(self._edges, pivots, component).S_world_camera
 
     def settled(self) -> Settled:
         """Move blocks to where they are likeliest; take out those whose place is not decided."""
@@ -91,7 +91,7 @@ class BlockReview:
                 break
             moved = self._frames(cut.block)
             nodes = {k: cut.turn.S_world_world @ S if k in moved else S for k, S in self.nodes.items()}
-            self.nodes = optimised(self._edges, self._pivots, nodes)
+            self.nodes = optimise_at_places(self._edges, self._pivots, nodes).S_world_camera
         turns = self._turns()
         open_ = self._open(turns, with_order=True)
         without = open_ if self._prior is None else self._open(turns, with_order=False)
@@ -143,17 +143,28 @@ class BlockReview:
 
     def _turns(self) -> list[Turn]:
         """All turns with what they gain."""
-        return [self._turn(S) for S in turns_said(self._edges, self.nodes)]
+        column = {k: n for n, k in enumerate(self.nodes)}
+        pairs: list[tuple[PairMatch, Similarity, float | None]] = []  # the world in the target's axes, odds as it is
+        for e in self._edges:
+            back = self.nodes[e.target].inverse()
+            pairs.append((e, back, e.log_odds_at(back @ self.nodes[e.source])))
+        ordered: list[tuple[int, int, Similarity, float]] = []  # frames whose place the order of capture tells
+        if self._prior is not None:
+            for j, S in self.nodes.items():
+                back = S.inverse()
+                usual = ((i, self._prior(i, j, back @ S_i)) for i, S_i in self.nodes.items() if i != j)
+                ordered += [(i, j, back, odds) for i, odds in usual if odds]
+        return [self._turn(S, column, pairs, ordered) for S in turns_said(self._edges, self.nodes)]
 
-    def _turn(self, turn: Similarity) -> Turn:
-        frames = list(self.nodes)
-        column = {k: n for n, k in enumerate(frames)}
-        surface, order = np.zeros((2, len(frames), len(frames)))
+    def _turn(
+        self, turn: Similarity, column: Mapping[int, int], pairs: Sequence[tuple[PairMatch, Similarity, float | None]],
+        ordered: Sequence[tuple[int, int, Similarity, float]],
+    ) -> Turn:  # fmt: skip
+        surface, order = np.zeros((2, len(column), len(column)))
         inverse = turn.inverse()
         alike = looks_alike(self._edges, self.nodes, turn)
-        for e in self._edges:
-            i, j, S = column[e.source], column[e.target], self.nodes[e.target].inverse()
-            here = e.log_odds_at(S @ self.nodes[e.source])
+        for e, S, here in pairs:
+            i, j = column[e.source], column[e.target]
             weight = 2 / (self._degree[e.source] + self._degree[e.target])  # see Assembly.compare
             for moved, kept, way in ((i, j, S @ turn), (j, i, S @ inverse)):
                 there = e.log_odds_at(way @ self.nodes[e.source])
@@ -163,12 +174,8 @@ class BlockReview:
                     before, after = (-MOST_AGAINST if odds is None else odds for odds in (here, there))
                     surface[moved, kept] += weight * (after - before)
         if self._prior is not None:
-            for i, S_i in self.nodes.items():
-                for j, S_j in self.nodes.items():
-                    if i != j:
-                        back = S_j.inverse()
-                        usual = self._prior(i, j, back @ S_i)
-                        order[column[i], column[j]] = self._prior(i, j, back @ turn @ S_i) - usual if usual else 0.0
+            for i, j, back, usual in ordered:
+                order[column[i], column[j]] = self._prior(i, j, back @ turn @ self.nodes[i]) - usual
         return Turn(turn, alike, surface, order)
 
 
@@ -181,12 +188,6 @@ def _distinct(sorted_deg: Sequence[float]) -> tuple[float, ...]:
     return tuple(found)
 
 
-def optimised(edges: Sequence[PairMatch], pivots: Pivots, nodes: Component) -> Component:
-    """All pairs optimised together, each at its place nearest to where its frames are."""
-    placed = at_places(edges, nodes)
-    return optimise_pose_graph(placed, pivots, nodes, edge_weights(placed)).S_world_camera
-
-
 def turns_said(edges: Sequence[PairMatch], nodes: Component) -> list[Similarity]:
     """Clearly different turns of the world after which some pair fits as well or nearly; the most likely first."""
     said: list[tuple[float, Similarity]] = []
@@ -194,9 +195,9 @@ def turns_said(edges: Sequence[PairMatch], nodes: Component) -> list[Similarity]
         target, source = nodes[e.target], nodes[e.source].inverse()
         here = e.log_odds_at(target.inverse() @ nodes[e.source])
         here = -MOST_AGAINST if here is None else here
-        for S, odds in [(e.S_target_source, 0.0), *((r.S_target_source, r.log_odds) for r in e.rivals)]:
-            turn = target @ S @ source
-            said += [(odds - here, turn), (odds - here, turn.inverse())]
+        for one in e.places:
+            turn, gain = target @ one.S_target_source @ source, one.log_odds - here
+            said += [(gain, turn), (gain, turn.inverse())]
     found: list[Similarity] = []
     known = np.tile(np.eye(3), (1 + MOST_TURNS, 1, 1))  # rotations of none, and of those that were found
     closest = 1 + 2 * np.cos(np.radians(SAME_TURN_DEG))  # trace of a rotation by that angle

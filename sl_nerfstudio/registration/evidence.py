@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.parallel import compiled, compiled_range
-from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, HIDDEN_DEPTH, LEAST_LIT_COSINE, Hypotheses
+from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, HIDDEN_DEPTH, LEAST_LIT_COSINE, Hypotheses, lit
 from sl_nerfstudio.registration.surfaces import (
     EmptyPlaces,
     FrameCloud,
@@ -269,9 +269,9 @@ def _residuals(
             nu, nv = int(u + 0.5), int(v + 0.5)
             seen = (d00 * (1 - fu) + d01 * fu) * (1 - fv) + (d10 * (1 - fu) + d11 * fu) * fv
             if not np.isfinite(seen):
-                codes[k, m] = 3
-                if empty[nv, nu] and _lit(X, Y, Z, A, B, C, light, least_lit):
-                    codes[k, m] = 2
+                codes[k, m] = UNDECODED
+                if empty[nv, nu] and lit(X, Y, Z, A, B, C, light, least_lit):
+                    codes[k, m] = ABSENT
                 continue
             br, bc = nv // block, nu // block
             off = 0.0
@@ -279,7 +279,7 @@ def _residuals(
                 off += smooth[br, bc, e] * other[k, e]
             rho = d - seen - off
             if rho > hidden:
-                codes[k, m] = 4
+                codes[k, m] = HIDDEN
                 continue
             na, nb, nc = float(smooth[br, bc, 5]), float(smooth[br, bc, 6]), float(smooth[br, bc, 7])
             cosine = -(na * X + nb * Y + nc * Z) / d
@@ -299,7 +299,7 @@ def _residuals(
             )  # by a motion along the point's own ray
             twist = 0.5 * (d00 + d11 - d01 - d10)
             sigma = np.sqrt(float(surface[nv, nu, 1]) ** 2 + (ea * points[m, 6]) ** 2 + twist * twist)
-            codes[k, m] = 1
+            codes[k, m] = JUDGED
             r = rho / sigma
             if (
                 width <= 0
@@ -308,7 +308,7 @@ def _residuals(
                     X, Y, Z, rho, shift, surface, code, camera, max(d00, d01, d10, d11) - min(d00, d01, d10, d11)
                 )
             ):
-                codes[k, m] = 4
+                codes[k, m] = HIDDEN
                 continue
             z[k, m] = r
             spread[k, m] = sigma / usual
@@ -374,27 +374,6 @@ def _behind_edge(X, Y, Z, rho, eye, surface, code, camera, jump):
             return False
         last = here
     return False
-
-
-@compiled
-def _lit(X, Y, Z, A, B, C, light, least_cosine):
-    """Whether a place would be seen and lit: `light` see EmptyPlaces."""
-    code, projector, T, reach = light
-    if least_cosine * np.sqrt(X * X + Y * Y + Z * Z) > -(A * X + B * Y + C * Z):
-        return False
-    x = T[0, 0] * X + T[0, 1] * Y + T[0, 2] * Z + T[0, 3]
-    y = T[1, 0] * X + T[1, 1] * Y + T[1, 2] * Z + T[1, 3]
-    z = T[2, 0] * X + T[2, 1] * Y + T[2, 2] * Z + T[2, 3]
-    a = T[0, 0] * A + T[0, 1] * B + T[0, 2] * C
-    b = T[1, 0] * A + T[1, 1] * B + T[1, 2] * C
-    c = T[2, 0] * A + T[2, 1] * B + T[2, 2] * C
-    distance = np.sqrt(x * x + y * y + z * z)
-    if -(a * x + b * y + c * z) < least_cosine * distance:
-        return False
-    column, row, front = pixel_of(code, x, y, z, projector)
-    if not (front and column >= 0 and row >= 0 and column < reach.shape[1] and row < reach.shape[0]):
-        return False
-    return distance < reach[int(row), int(column)]
 
 
 @dataclass(frozen=True)

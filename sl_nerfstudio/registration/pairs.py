@@ -166,17 +166,19 @@ class PairMatch:
         """Whether tones hold the frames where surfaces alone would let them slip."""
         return self.by_shape is not None
 
+    @property
+    def places(self) -> tuple[Rival, ...]:
+        """Its place and the rivals: all with their log-odds against it."""
+        return Rival(self.S_target_source, 0.0), *self.rivals
+
     @cached_property
-    def _places(self) -> tuple[Float64[ndarray, "m 3 3"], Float64[ndarray, "m"]]:
-        """Rotations of all places, and their log-odds against the best one."""
-        return (
-            np.stack([self.S_target_source.R, *(rival.S_target_source.R for rival in self.rivals)]),
-            np.array([0.0, *(rival.log_odds for rival in self.rivals)]),
-        )
+    def _rotations(self) -> tuple[Float64[ndarray, "m 3 3"], Float64[ndarray, "m"]]:
+        """Rotations of all places, and their log-odds."""
+        return np.stack([one.S_target_source.R for one in self.places]), np.array([one.log_odds for one in self.places])
 
     def log_odds_at(self, S: Similarity) -> float | None:
         """Log-odds of a place against the best one, nats; None for places that the pair does not know."""
-        R, odds = self._places
+        R, odds = self._rotations
         near = np.einsum("mij,ij->m", R, S.R) >= 1 + 2 * math.cos(math.radians(SAME_TURN_DEG))
         return float(odds[near].max()) if near.any() else None
 

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 
 from sl_nerfstudio.geometry.lie import Similarities, Similarity, angle_deg, exps_at, logs_at
 from sl_nerfstudio.geometry.numerics import geman_mcclure_cost, geman_mcclure_weight
-from sl_nerfstudio.registration.pairs import PairMatch
+from sl_nerfstudio.registration.pairs import PairMatch, edge_weights
 
 KERNEL_CHI2 = 40.0  # chi square (7 degrees of freedom) at which an edge counts a quarter: errors are not quite normal
 FIRST_KERNEL_FACTOR = 30.0  # on it to begin with: the drift of a component must be within, wrong pairs beyond
@@ -90,8 +90,7 @@ def at_places(edges: Sequence[PairMatch], nodes: Mapping[int, Similarity]) -> li
     for e in edges:
         if e.rivals and e.source in nodes and e.target in nodes:
             here = nodes[e.target].inverse() @ nodes[e.source]
-            places = [e.S_target_source, *(rival.S_target_source for rival in e.rivals)]
-            nearest = min(places, key=lambda S: angle_deg(S.R @ here.R.T))
+            nearest = min((one.S_target_source for one in e.places), key=lambda S: angle_deg(S.R @ here.R.T))
             out.append(e if nearest is e.S_target_source else replace(e, S_target_source=nearest))
         else:
             out.append(e)
@@ -127,6 +126,13 @@ def optimise_pose_graph(
         each = every.each()
         nodes = {k: each[k] for k in nodes}
     return PoseGraphSolution(nodes, chi2 < REJECTION_FACTOR * KERNEL_CHI2)
+
+
+def optimise_at_places(
+    edges: Sequence[PairMatch], pivots: Pivots, start: Mapping[int, Similarity]
+) -> PoseGraphSolution:
+    """Optimise all edges inside a component together, each at its place nearest to where its frames are."""
+    return optimise_pose_graph(at_places(edges, start), pivots, start, edge_weights(edges))
 
 
 def _optimised(

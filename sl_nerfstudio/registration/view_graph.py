@@ -27,7 +27,6 @@ from sl_nerfstudio.registration.pairs import (
     SAME_SHIFT,
     PairMatch,
     Search,
-    edge_weights,
     is_accepted,
     register_pair,
     search_score,
@@ -36,8 +35,7 @@ from sl_nerfstudio.registration.pose_graph import (
     Component,
     Pivots,
     PoseGraphSolution,
-    at_places,
-    optimise_pose_graph,
+    optimise_at_places,
 )
 from sl_nerfstudio.registration.surfaces import SurfaceMap
 
@@ -178,15 +176,12 @@ class ViewGraph:
         trials = [(p, ROUGH if g else search, g) for p, g in zip(new, guesses, strict=True)]
         self._register(trials, "registering pairs")
 
-    def try_overlapping(self, S_world_camera: Component, within_deg: float = 180.0) -> None:
-        """Register pairs that should overlap by the given poses, starting from there.
-
-        What ends turned against its start by more than `within_deg` degrees counts for nothing.
-        """
+    def try_overlapping(self, S_world_camera: Component) -> None:
+        """Register pairs that should overlap by the given poses, starting from there."""
         pairs = self._overlapping(S_world_camera)
         guesses = [_relative(S_world_camera, p) for p in pairs]
         trials = [(p, NEARBY, g) for p, g in zip(pairs, guesses, strict=True) if g]
-        self._register(trials, "closing loops", within_deg)
+        self._register(trials, "closing loops")
 
     def try_all(self) -> None:
         """Register every frame with those that look most like it, wherever they are in the order."""
@@ -286,25 +281,20 @@ class ViewGraph:
 
     def solve(self, component: Component) -> PoseGraphSolution:
         """A component with the pairs that hold it optimised together, each where its frames are."""
-        edges = at_places(self.holding(component), component)
-        return optimise_pose_graph(edges, self.pivots, component, edge_weights(edges))
+        return optimise_at_places(self.holding(component), self.pivots, component)
 
     def holding(self, component: Component) -> list[PairMatch]:
         """The pairs, without those inside a component that may slip, if the others hold it together."""
         return without_slipping(self.edges, component)
 
-    def _register(
-        self, trials: Sequence[tuple[Pair, Search, Similarity | None]], words: str, within_deg: float = 180.0
-    ) -> None:
+    def _register(self, trials: Sequence[tuple[Pair, Search, Similarity | None]], words: str) -> None:
         """Register pairs, and keep the better result of a pair that was tried before."""
         rngs = self.rng.spawn(len(trials))
         tasks = [
             partial(register_pair, self._frames(pair), pair, search, rng, guess, self._known(pair))
             for (pair, search, guess), rng in zip(trials, rngs, strict=True)
         ]
-        for (pair, _, guess), match in zip(trials, tracked(tasks, words), strict=True):
-            if match is not None and guess is not None and _turned_deg(match, guess) > within_deg:
-                continue
+        for (pair, _, _), match in zip(trials, tracked(tasks, words), strict=True):
             if match is not None or pair not in self._tried:
                 self._tried[pair] = match
 
@@ -350,8 +340,8 @@ class ViewGraph:
 
 def _densities(e: PairMatch, step: UsualStep) -> tuple[float, float]:
     """Of the turn of a pair, over the places that it allows: by the usual step, and of a turn by anything."""
-    angle = np.array([angle_deg(e.S_target_source.R), *(angle_deg(r.S_target_source.R) for r in e.rivals)])
-    odds = np.array([0.0, *(r.log_odds for r in e.rivals)])
+    angle = np.array([angle_deg(one.S_target_source.R) for one in e.places])
+    odds = np.array([one.log_odds for one in e.places])
     odds = np.exp(odds - odds.max())
     off = (angle / abs(e.target - e.source) - step.deg) / step.sigma_deg
     usual = np.exp(-0.5 * off**2) / (step.sigma_deg * math.sqrt(2 * math.pi))
@@ -360,9 +350,7 @@ def _densities(e: PairMatch, step: UsualStep) -> tuple[float, float]:
 
 def likely_places(match: PairMatch) -> list[Similarity]:
     """Where a pair may belong: its best place, and those that are nearly as likely."""
-    return [
-        match.S_target_source, *(r.S_target_source for r in match.rivals if r.log_odds > -LEAST_ODDS)
-    ]  # fmt: skip
+    return [one.S_target_source for one in match.places if one.log_odds > -LEAST_ODDS]
 
 
 def compared_pairs(rank: Float64[ndarray, "n n"], most: int) -> list[Pair]:
@@ -394,11 +382,6 @@ def _connected(component: Component, edges: Sequence[PairMatch]) -> bool:
     size = len(component)
     links = coo_array((np.ones(len(inside)), (rows, columns)), shape=(size, size))
     return bool(connected_components(links, directed=False)[0] == 1)
-
-
-def _turned_deg(match: PairMatch, guess: Similarity) -> float:
-    """Angle between a result and what it started from, in degrees."""
-    return angle_deg(match.S_target_source.R @ guess.R.T)
 
 
 def _relative(nodes: Component, pair: Pair) -> Similarity | None:
