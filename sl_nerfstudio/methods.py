@@ -3,6 +3,7 @@
 import copy
 import inspect
 import sys
+import warnings
 from dataclasses import fields
 from pathlib import Path
 from types import TracebackType
@@ -157,5 +158,7 @@ def train(
     quiet_nerfstudio(True)
     config.begin()
     config.save_config()
-    train_loop(0, 1, config)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, about torch
+        train_loop(0, 1, config)
     return config.get_base_dir() / "config.yml"
