@@ -1,6 +1,5 @@
 """`ns-train sl-neus` and `ns-train sl-neus-paper`."""
 
-import copy
 import inspect
 import sys
 import warnings
@@ -139,11 +138,12 @@ def train(
     Returns the run's config.yml, which `load_run` takes. Raises UserError for a faulty scan, settings that do not
     exist, and a folder that is in use.
     """
-    method_config = {"sl-neus": sl_neus, "sl-neus-paper": sl_neus_paper}[method].config
-    config: Any = copy.deepcopy(method_config)
-    config.data, config.output_dir, config.timestamp = Path(scan), Path(output), name
-    config.experiment_name = Path(scan).absolute().name
-    config.max_num_iterations = config.max_num_iterations if steps is None else steps
+    # which themselves load this module, for its list of methods
+    from nerfstudio.scripts.train import train_loop
+
+    from sl_nerfstudio.model.train import settings_of_run
+
+    config = settings_of_run(method, Path(scan), Path(output), Path(scan).absolute().name, name, steps)
     config.pipeline.datamanager.data = config.data
     unknown = sorted(set(settings) - {field.name for field in fields(config.pipeline.model)})
     if unknown:
@@ -153,8 +153,6 @@ def train(
         )
     for field, value in settings.items():
         setattr(config.pipeline.model, field, value)
-    from nerfstudio.scripts.train import train_loop  # which itself loads this module, for its list of methods
-
     quiet_nerfstudio(True)
     config.begin()
     config.save_config()

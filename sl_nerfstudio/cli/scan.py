@@ -281,7 +281,8 @@ class Work:
                 complete = read_checkpoint(last_checkpoint(config, path)).step >= config.last_step
             else:
                 shutil.rmtree(path.parent, ignore_errors=True)  # stopped before it had saved anything
-                config = settings_of_run(self.scan_root, output, "training", path.parent.name, steps, refined)
+                config = settings_of_run("sl-neus", self.scan_root, output, "training", path.parent.name, steps)
+                config.pipeline.model.refine_poses = refined
                 complete = False
             if complete:
                 say(_kept("train", path.parent))

@@ -1,4 +1,4 @@
-"""`ns-train sl-neus` as a part of another command."""
+"""`ns-train` as a part of another command or program."""
 
 from copy import deepcopy
 from pathlib import Path
@@ -10,11 +10,11 @@ from nerfstudio.scripts import train
 from sl_nerfstudio.model.run_files import part_of, quiet_nerfstudio
 
 
-def settings_of_run(scan: Path, output: Path, experiment: str, name: str, steps: int, refine_poses: str) -> Any:
-    """The settings of a new run in `output`/`experiment`/sl-neus/`name`."""
-    config: Any = deepcopy(all_methods["sl-neus"])
+def settings_of_run(method: str, scan: Path, output: Path, experiment: str, name: str, steps: int | None) -> Any:
+    """The settings of a new run in `output`/`experiment`/`method`/`name`; steps: None for as many as is usual."""
+    config: Any = deepcopy(all_methods[method])
     config.data, config.output_dir, config.experiment_name, config.timestamp = scan, output, experiment, name
-    config.max_num_iterations, config.pipeline.model.refine_poses = steps, refine_poses
+    config.max_num_iterations = config.max_num_iterations if steps is None else steps
     return config
 
 
