@@ -69,6 +69,7 @@ def test_wrong_input_is_said_as_everywhere(tmp_path: Path) -> None:
         sl.train(tmp_path, tmp_path, poses="rigid-rig")
 
 
+@pytest.mark.slow
 def test_a_surface_is_compared_with_cad(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     sl.write_mesh(tmp_path / "part.stl", bracket(), units="mm")
     sl.write_mesh(tmp_path / "mesh.ply", scanned(bracket(), S=ANYWHERE), units="mm")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.evaluation.mesh_index import Closest, IndexedMesh, neighbours
@@ -19,12 +20,17 @@ from sl_nerfstudio.geometry.lie import AXIS_TURNS, Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 
 _STARTS = 120  # random orientations, besides those of the principal axes
-_ROUNDS = ((200, 14, 48), (1000, 20, 24), (3000, 25, 24))  # points, ICP steps, places that are kept
+_ROUNDS = ((200, 14, 48), (1000, 20, 24))  # points, ICP steps, places that are kept, with samples of the part
+_POINTS, _LAST_STEPS = 3000, 20  # with the part itself
+_SAMPLES = 10_000  # of the part
+_BESIDE = 2.0  # spacings of the samples
+_LIKELY, _SAME_FIT = 9.0, 0.002  # squared distances, relative to the best ones, and distance relative to the diagonal
 _WIDEST = 0.03  # of the part's diagonal: greater distances count as this one
 _FACING = 0.3  # cosine between normals, below which a point lies on another side of the part
 _LEAST_FACING = 0.1  # share of the points; with fewer a place is not followed
 _AT_EDGES = 0.02  # share of the points that may seem so, because they lie beside an edge
 _SAME_TURN_DEG, _SAME_SHIFT = 3.0, 0.02  # places that are nearer (shift: of the diagonal) are the same one
+_COMPOSED = 3  # symmetries that are composed with all others, and how often
 _SMALL = 0.1  # of the diagonal: a result that need not move farther is in the part's axes already
 _AS_GOOD = 1.1  # ratio of mean squared distances up to which two places fit equally well
 _EXACT = 1e-5  # of the diagonal: smaller distances are rounding
@@ -66,20 +72,46 @@ class PartAlignment:
         return self.rms < _FITS * self.size
 
 
-class _Points:
-    """Points of the result with normals, and how well they fit the part."""
+class _SampledPart:
+    """Nearest points of a part by way of samples with normals: good to their spacing, and quick far away from it."""
 
-    def __init__(self, part: IndexedMesh, points: Float64[ndarray, "n 3"], normals: Float64[ndarray, "n 3"]) -> None:
+    def __init__(self, part: IndexedMesh, seed: int) -> None:
+        self.points, self.normals = part.sample(_SAMPLES, seed)
+        self._spacing = _BESIDE * float(np.sqrt(part.area / _SAMPLES))
+        self._tree = KDTree(self.points)
+
+    def closest(self, points: Float64[ndarray, "n 3"]) -> Closest:
+        """The foot on the plane of the nearest sample if that is beside it, else the sample."""
+        _, index = self._tree.query(points)
+        foot, normal = self.points[index], self.normals[index]
+        offset = points - foot
+        along = (offset * normal).sum(1, keepdims=True) * normal
+        beside = np.linalg.norm(offset - along, axis=1, keepdims=True) < self._spacing
+        foot = np.where(beside, points - along, foot)
+        return Closest(np.linalg.norm(points - foot, axis=1), foot, normal)
+
+
+class _Points:
+    """Points of the result with normals, and how well they fit the part, or its samples."""
+
+    def __init__(
+        self,
+        part: IndexedMesh,
+        points: Float64[ndarray, "n 3"],
+        normals: Float64[ndarray, "n 3"],
+        samples: _SampledPart | None = None,
+    ) -> None:
         self.part, self.points, self.normals = part, points, normals
+        self.closest = (part if samples is None else samples).closest
         self.widest = _WIDEST * part.diagonal
 
-    def some(self, count: int) -> "_Points":
+    def some(self, count: int, samples: _SampledPart) -> "_Points":
         step = max(1, len(self.points) // count)
-        return _Points(self.part, self.points[::step], self.normals[::step])
+        return _Points(self.part, self.points[::step], self.normals[::step], samples)
 
     def costs(self, places: Sequence[Similarity]) -> Float64[ndarray, "k"]:
         """Mean squared distance at some places, in the result's own scale; points on another side count as far."""
-        near = self.part.closest(np.concatenate([S.points(self.points) for S in places]))
+        near = self.closest(np.concatenate([S.points(self.points) for S in places]))
         facing = (np.concatenate([self.normals @ S.R.T for S in places]) * near.normal).sum(1)
         squares = (np.minimum(near.distance, self.widest).reshape(len(places), -1) ** 2).mean(1)
         other_side = np.maximum((facing < _FACING).reshape(len(places), -1).mean(1) - _AT_EDGES, 0)
@@ -96,7 +128,7 @@ class _Points:
         now = list(places)
         for _ in range(steps):
             moved = [S.points(self.points) for S in now]
-            near = self.part.closest(np.concatenate(moved))
+            near = self.closest(np.concatenate(moved))
             for k, p in enumerate(moved):
                 own = slice(k * len(p), (k + 1) * len(p))
                 facing = ((self.normals @ now[k].R.T) * near.normal[own]).sum(1) > _FACING
@@ -122,25 +154,26 @@ def place_on_part(result: Mesh, part: Mesh, with_scale: bool = False, seed: int 
     """
     indexed = IndexedMesh(part)
     whole = IndexedMesh(result)
-    every = _Points(indexed, *whole.sample(_ROUNDS[-1][0], seed))
+    every = _Points(indexed, *whole.sample(_POINTS, seed))
     places = _starts(every, with_scale, seed)
-    costs = np.empty(0)
+    samples, costs = _SampledPart(indexed, seed), np.empty(0)
     for count, steps, kept in _ROUNDS:
-        some = every.some(count)
-        places = some.followed(places, steps, with_scale)
-        costs = some.costs(places)
-        order = np.argsort(costs)
-        places, costs = _distinct([places[k] for k in order], costs[order], every, OPEN_TO_NOTHING, kept)
+        some = every.some(count, samples)
+        places, costs = _best(some.followed(places, steps, with_scale), some, kept)
+    # To the end only those that may turn out as good, and two others.
+    likely = int((costs < _LIKELY * costs[0] + (_SAME_FIT * indexed.diagonal) ** 2).sum()) + 2
+    places, costs = _best(every.followed(places[:likely], _LAST_STEPS, with_scale), every, likely)
     # Below the facets' own distance from the surfaces, and below rounding, places do not differ.
     fits = _AS_GOOD * costs[0] + facet_sag(indexed) ** 2 + (_EXACT * indexed.diagonal) ** 2
     # The axes that the result has count before others that fit no better.
-    own = every.followed([Similarity.identity()], 2 * _ROUNDS[-1][1], with_scale)[0]
+    own = every.followed([Similarity.identity()], 2 * _LAST_STEPS, with_scale)[0]
     in_place = bool(every.costs([own])[0] <= fits and _small(own, every))
     if in_place:
         places, costs = [own, *places], np.concatenate([every.costs([own]), costs])
     motions = _open_motions(every, places[0], fits)
     places, costs = _distinct(places, costs, every, motions, len(places))
-    turns = [(S @ places[0].inverse()).R for S, cost in zip(places[1:], costs[1:], strict=True) if cost <= fits]
+    equal = _completed([S for S, cost in zip(places, costs, strict=True) if cost <= fits], every, motions, fits)
+    turns = [(S @ places[0].inverse()).R for S in equal[1:]]
     worse = [S for S, cost in zip(places[1:], costs[1:], strict=True) if cost > fits]
     return PartAlignment(
         places[0],
@@ -151,6 +184,20 @@ def place_on_part(result: Mesh, part: Mesh, with_scale: bool = False, seed: int 
         tuple(turns),
         every.rms(worse[0]) if worse else None,
     )
+
+
+def _completed(equal: list[Similarity], points: _Points, motions: OpenMotions, fits: float) -> list[Similarity]:
+    """Equally good places with those that follow from them: after one symmetry of the part, another is one, too."""
+    for _ in range(_COMPOSED):
+        symmetries = [S @ equal[0].inverse() for S in equal[1 : 1 + _COMPOSED]]
+        places = [*equal, *(G @ S for G in symmetries for S in equal)]
+        costs = points.costs(places)
+        good = [S for k, S in enumerate(places) if k < len(equal) or costs[k] <= fits]
+        more, _ = _distinct(good, np.zeros(len(good)), points, motions, len(good))
+        if len(more) == len(equal):
+            break
+        equal = more
+    return equal
 
 
 def _small(S: Similarity, points: _Points) -> bool:
@@ -176,6 +223,13 @@ def _starts(points: _Points, with_scale: bool, seed: int) -> list[Similarity]:
 
 
 OPEN_TO_NOTHING = OpenMotions(np.empty((0, 3)), np.empty((0, 3)), np.zeros(3))
+
+
+def _best(places: Sequence[Similarity], points: _Points, most: int) -> tuple[list[Similarity], Float64[ndarray, "m"]]:
+    """The best of the places, the first one first, without others of the same."""
+    costs = points.costs(places)
+    order = np.argsort(costs)
+    return _distinct([places[k] for k in order], costs[order], points, OPEN_TO_NOTHING, most)
 
 
 def _distinct(

@@ -160,6 +160,7 @@ def test_reference_points_take_the_place_of_a_mesh(scan: Path, untrue: Path, tmp
     assert "camera" not in content
 
 
+@pytest.mark.slow
 def test_reference_mesh_takes_the_place_of_the_truth(scan: Path, tmp_path: Path) -> None:
     truth = read_mesh(mesh_of(scan))
     write_mesh(tmp_path / "moved.ply", Mesh(truth.vertices + [0.0, 0.0, 0.7], truth.faces))

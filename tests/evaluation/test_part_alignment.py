@@ -25,12 +25,14 @@ def test_half_of_a_part_without_symmetry_has_one_place(with_scale: bool) -> None
 
 
 @pytest.mark.slow
-def test_a_box_fits_in_four_ways_and_one_in_its_own_axes_stays_there() -> None:
+def test_a_box_fits_in_four_ways_a_cube_in_24_and_a_box_in_its_own_axes_stays_there() -> None:
     box = of_trimesh(trimesh.creation.box((60, 40, 25)))
+    cube = of_trimesh(trimesh.creation.box((40, 40, 40)))
     found = place_on_part(scanned(box), box)
     assert not found.open_motions
     half_turns = sorted(np.abs(np.diag(R)).round(6).tolist() + np.diag(R).round(2).tolist() for R in found.equal_turns)
     assert half_turns == [[1, 1, 1, -1, -1, 1], [1, 1, 1, -1, 1, -1], [1, 1, 1, 1, -1, -1]]
+    assert len(place_on_part(scanned(cube), cube).equal_turns) == 23
     near = Similarity(1.0, np.eye(3), np.array([0.4, -0.2, 0.1]))
     there = place_on_part(scanned(box, S=near), box)
     assert there.in_place
