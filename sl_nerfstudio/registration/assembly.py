@@ -67,8 +67,8 @@ class Assembly:
             edges: pairs that say where components may belong.
             prior: log-odds, in nats, of the place of a frame on another by the order of capture.
         """
-        self._scan, self._pivots, self._prior = scan, pivots, prior
-        self._edges = sorted(edges, key=lambda e: -e.lead)
+        self._scan, self.pivots, self.prior = scan, pivots, prior
+        self.edges = sorted(edges, key=lambda e: -e.lead)
         self._decisions: dict[tuple[int, int], Decision | None] = {}  # by the numbers of two components
         self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(pivots))]
         self._number = list(range(len(pivots)))  # of each frame's component
@@ -82,13 +82,13 @@ class Assembly:
             self.components.append(self._joined(first, second, S))
             self._joins += 1
             for k in self.components[-1]:
-                self._number[k] = len(self._pivots) - 1 + self._joins
+                self._number[k] = len(self.pivots) - 1 + self._joins
         return sorted(self.components, key=lambda c: (-len(c), min(c)))
 
     def _next_join(self) -> tuple[Component, Component, Similarity] | None:
         """The first join that is decided; if none is, the one that leads most."""
         best: tuple[float, Component, Component, Similarity] | None = None
-        for edge in self._edges:
+        for edge in self.edges:
             a, b = self._number[edge.target], self._number[edge.source]
             if a == b:
                 continue
@@ -116,7 +116,7 @@ class Assembly:
     def _joined(self, first: Component, second: Component, S: Similarity) -> Component:
         """Merge both in the world of the first, with all pairs inside optimised together."""
         both = {**first, **{k: S @ S_second for k, S_second in second.items()}}
-        found = optimise_at_places(self._edges, self._pivots, both).S_world_camera
+        found = optimise_at_places(self.edges, self.pivots, both).S_world_camera
         return {k: found[k] for k in both}
 
     def decide(self, first: Component, second: Component) -> Similarity | None:
@@ -189,19 +189,19 @@ class Assembly:
         for k, S in enumerate(places):
             for m, other in enumerate(places[:k]):
                 turns = ((first, S @ other.inverse()), (second, S.inverse() @ other))
-                out[k, m] = out[m, k] = any(looks_alike(self._edges, part, turn) for part, turn in turns)
+                out[k, m] = out[m, k] = any(looks_alike(self.edges, part, turn) for part, turn in turns)
         return out
 
     def usual(self, first: Component, second: Component, S: Similarity) -> float:
         """Log-odds of a place by the order of capture."""
-        if self._prior is None:
+        if self.prior is None:
             return 0.0
-        return sum(self._prior(i, j, first[i].inverse() @ S @ second[j]) for i in first for j in second)
+        return sum(self.prior(i, j, first[i].inverse() @ S @ second[j]) for i in first for j in second)
 
     def _between(self, first: Component, second: Component) -> list[PairMatch]:
         return [
             e
-            for e in self._edges
+            for e in self.edges
             if (e.source in first and e.target in second) or (e.source in second and e.target in first)
         ]
 
@@ -221,9 +221,9 @@ class Assembly:
             return True
         shifts = []
         for k, S in second.items():
-            p, radius = S.points(self._pivots.centre[k][None]), a.scale * S.scale * self._pivots.radius[k]
+            p, radius = S.points(self.pivots.centre[k][None]), a.scale * S.scale * self.pivots.radius[k]
             shifts.append(float(np.linalg.norm(a.points(p) - b.points(p))) / radius)
-        return min(shifts) > SAME_PLACE_SHIFT
+        return bool(min(shifts) > SAME_PLACE_SHIFT)
 
 
 def looks_alike(edges: Sequence[PairMatch], nodes: Component, turn: Similarity) -> bool:

@@ -15,9 +15,9 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import Assembly, Prior, looks_alike
+from sl_nerfstudio.registration.assembly import Assembly, looks_alike
 from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_TURN_DEG, TONE_ODDS, PairMatch
-from sl_nerfstudio.registration.pose_graph import Component, Pivots, optimise_at_places
+from sl_nerfstudio.registration.pose_graph import Component, optimise_at_places
 
 MOST_TURNS = 48  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
@@ -73,13 +73,11 @@ class Cut:
 class BlockReview:
     """Looks for blocks that fit as well elsewhere: by pairs that were registered, then by all frames that face them."""
 
-    def __init__(
-        self, assembly: Assembly, pivots: Pivots, edges: Sequence[PairMatch], component: Component, prior: Prior | None
-    ) -> None:
-        self._assembly, self._pivots, self._prior = assembly, pivots, prior
-        self._edges = [e for e in edges if e.source in component and e.target in component]
+    def __init__(self, assembly: Assembly, component: Component) -> None:
+        self._assembly, self._pivots, self._prior = assembly, assembly.pivots, assembly.prior
+        self._edges = [e for e in assembly.edges if e.source in component and e.target in component]
         self._degree = Counter(k for e in self._edges for k in (e.source, e.target))
-        self.nodes = optimise_at_places(self._edges, pivots, component).S_world_camera
+        self.nodes = optimise_at_places(self._edges, self._pivots, component).S_world_camera
 
     def settled(self) -> Settled:
         """Move blocks to where they are likeliest; take out those whose place is not decided."""

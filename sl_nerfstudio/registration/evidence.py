@@ -452,7 +452,8 @@ class Compared:
 
     def overlaps(self, other: "Compared", share: float) -> bool:
         """Whether the first place lets at least a share of the points be judged that the other's does."""
-        return (self.codes[0] == JUDGED).sum() >= share * (other.codes[0] == JUDGED).sum()
+        judged, least = (self.codes[0] == JUDGED).sum(), share * (other.codes[0] == JUDGED).sum()
+        return bool(judged >= least)
 
 
 def density(size: Float32[ndarray, "*n"], spread: Float32[ndarray, "*n"]) -> Float32[ndarray, "*n"]:

@@ -223,18 +223,17 @@ class ViewGraph:
         frames are put together all the same.
         """
         edges, scan = self.edges, self.evidence()
+        self.by_order, self.open, self.turns_deg = False, [], ()
         assembly = self.assembly([e for e in edges if e.holds], scan)
         components = assembly.grow()
         if len(components[0]) == 1:
             return self.assembly(edges, scan).grow()
-        found: list[Component] = []
-        self.by_order, self.open, turns = False, [], set[float]()
+        found, turns = list[Component](), set[float]()
         for component in components:
             if len(component) == 1:
                 found.append(component)
                 continue
-            edges = self.holding(component)
-            one = BlockReview(assembly, self.pivots, edges, component, self.usual_step).settled()
+            one = BlockReview(assembly, component).settled()
             found += [one.decided, *(block.nodes for block in one.open)]
             self.open += one.open
             turns |= set(one.turns_deg)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import Prior, looks_alike
+from sl_nerfstudio.registration.assembly import Assembly, Prior, looks_alike
 from sl_nerfstudio.registration.blocks import BlockReview, Settled, Turn, best_block
 from sl_nerfstudio.registration.evidence import Comparison
 from sl_nerfstudio.registration.pairs import PairMatch, Rival
@@ -40,11 +40,11 @@ def pairs(odds_turned: float) -> list[PairMatch]:
     return found
 
 
-class Said:
+class Said(Assembly):
     """An assembly in which the pairs themselves say by how much one place leads another."""
 
     def __init__(self, edges: list[PairMatch], prior: Prior | None) -> None:
-        self.edges, self.prior = edges, prior
+        self.edges, self.pivots, self.prior = edges, pivots_of(NODES), prior
 
     def compare(self, first, second, places, alike: bool = False) -> Comparison:
         odds = np.zeros(len(places))
@@ -58,14 +58,9 @@ class Said:
         none.shared[:] = odds[:, None] - odds
         return none
 
-    def usual(self, first, second, S) -> float:
-        if self.prior is None:
-            return 0.0
-        return sum(self.prior(i, j, first[i].inverse() @ S @ second[j]) for i in first for j in second)
-
 
 def review(edges: list[PairMatch], start: dict[int, Similarity], prior=None) -> Settled:
-    return BlockReview(Said(edges, prior), pivots_of(NODES), edges, start, prior).settled()
+    return BlockReview(Said(edges, prior), start).settled()
 
 
 def off_deg(nodes: dict[int, Similarity]) -> float:

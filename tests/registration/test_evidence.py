@@ -193,7 +193,7 @@ def plane_frame(camera: Device, normal: ndarray, height: float, seed: int) -> Fr
 
 @pytest.mark.parametrize("name", sorted(CAMERAS))
 def test_the_normal_equations_are_those_of_differences_of_the_residuals(name):
-    camera = replace(CAMERAS[name].scaled(8), w=480, h=360)  # fine enough for the surface between its places
+    camera = replace(CAMERAS[name].scaled(8.0), w=480, h=360)  # fine enough for the surface between its places
     rng = np.random.default_rng(3)
     normal, height, width = unit(np.array([0.2, -0.3, 1.0])), 3.0, 2.5
     S = Similarity(1.3, Rotation.from_rotvec([0.05, -0.1, 0.2]).as_matrix(), np.array([0.1, 0.05, 0.2]))
