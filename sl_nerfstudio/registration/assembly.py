@@ -240,7 +240,8 @@ class Assembly:
 
     def differ(self, first: Component, second: Component, a: Component, b: Component) -> bool:
         """Whether two components are at clearly different places, to each other, in two worlds."""
-        return self._differ(*(self._between_worlds(first, second, at) for at in (a, b)), second)
+        S_a, S_b = self._between_worlds(first, second, a), self._between_worlds(first, second, b)
+        return self._differ(S_a, S_b, second)
 
     def usual(self, first: Component, second: Component, nodes: Component) -> float:
         """Log-odds of a place of two components by the order of capture."""
