@@ -225,8 +225,8 @@ class Assembly:
         """Whether a pair fits as well after its source is moved by a turn of the world."""
         if not e.rivals or e.source not in nodes or e.target not in nodes:
             return False
-        back = nodes[e.target].inverse()
-        here, there = e.log_odds_at(back @ nodes[e.source]), e.log_odds_at(back @ turn @ nodes[e.source])
+        here = e.log_odds_at(relative(nodes, e.source, e.target))
+        there = e.log_odds_at(nodes[e.target].inverse() @ turn @ nodes[e.source])
         return here is not None and there is not None and abs(here - there) < LEAST_ODDS
 
     def _known_alike(self, first: Component, second: Component, places: Sequence[Similarity]) -> Bool[ndarray, "k k"]:

@@ -17,7 +17,7 @@ from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, angle_deg
 from sl_nerfstudio.parallel import one_library_thread, results, tracked
 from sl_nerfstudio.registration.agreement import PENALTY
-from sl_nerfstudio.registration.assembly import facing
+from sl_nerfstudio.registration.assembly import facing, relative
 from sl_nerfstudio.registration.evidence import Frame, ScanEvidence
 from sl_nerfstudio.registration.pairs import (
     ANYWHERE,
@@ -181,7 +181,7 @@ def _support_of(k: int, solution: PoseGraphSolution, scan: ScanEvidence) -> tupl
     if k not in nodes:
         return 0.0, 0.0
     others = {j: S for j, S in nodes.items() if j != k}
-    found = [scan.agreement(i, j, nodes[j].inverse() @ nodes[i]) for i, j in facing({k: nodes[k]}, others, FACING)]
+    found = [scan.agreement(i, j, relative(nodes, i, j)) for i, j in facing({k: nodes[k]}, others, FACING)]
     odds, agreeing, expected = (math.fsum(each) for each in zip(*found, strict=True)) if found else (0.0, 0.0, 0.0)
     return odds, agreeing / expected if expected else 0.0
 
