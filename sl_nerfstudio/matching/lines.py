@@ -63,17 +63,6 @@ class EpipolarLines:
         _follow(*self.arrays, w, out)
         return out
 
-    def pixels_at(self, w: float, x: Float32[ndarray, "h w"], y: Float32[ndarray, "h w"]) -> None:
-        """Fill columns and rows in the pattern's image, the first pixel's centre being 0, at one inverse distance.
-
-        They are far outside where the projector does not see the point.
-        """
-        code, parameters, ray, centre, offset = self.arrays
-        if code == 0 and not parameters[4:].any():
-            _pinhole_pixels(parameters, self._planes, centre, w, x, y)
-        else:
-            _pixels(code, parameters, ray, centre, offset, w, x, y)
-
     def slopes(self, w: Float64[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
         """Derivative of the coordinates by the inverse distance."""
         out = np.empty(self.offset.shape, dtype=np.float32)
@@ -86,11 +75,11 @@ class EpipolarLines:
         _nearest(*self.arrays, coords, out)
         return out
 
-    @cached_property
-    def _planes(self) -> Float32[ndarray, "5 h w"]:
-        """Rays and offsets, one coordinate after the other."""
+    @property
+    def for_tiles(self) -> tuple[int, ndarray, ndarray, Float32[ndarray, "5 h w"]]:
+        """Arguments of `places_on_lines`: model code and parameters, centre, rays and offsets one after the other."""
         values = np.concatenate([self.ray, self.offset], axis=-1, dtype=np.float32)
-        return np.ascontiguousarray(np.moveaxis(values, -1, 0))
+        return *for_loops(self.projector), self.centre, np.ascontiguousarray(np.moveaxis(values, -1, 0))
 
     @cached_property
     def arrays(self) -> tuple[int, ndarray, ndarray, ndarray, ndarray]:
@@ -222,32 +211,29 @@ def _follow(
 
 
 @compiled
-def _pixels(
-    code: int, parameters: ndarray, ray: ndarray, centre: ndarray, offset: ndarray, w: float, x: ndarray, y: ndarray
+def places_on_lines(
+    code: int, parameters: ndarray, planes: ndarray, centre: ndarray, w: float, x: ndarray, y: ndarray
 ) -> None:
-    for row in range(x.shape[0]):
-        for column in range(x.shape[1]):
-            u, v, front = pixel_of(code, *_point(ray[row, column], centre, w), parameters)
-            x[row, column] = u + offset[row, column, 0] - 0.5 if front else OUTSIDE_PX
-            y[row, column] = v + offset[row, column, 1] - 0.5 if front else OUTSIDE_PX
+    """Fill columns and rows in the pattern's image, the first pixel's centre being 0, at one inverse distance.
 
-
-@compiled
-def _pinhole_pixels(parameters: ndarray, planes: ndarray, centre: ndarray, w: float, x: ndarray, y: ndarray) -> None:
-    """Fill columns and rows for a pinhole without distortion, ten times as fast."""
+    They are far outside where the projector does not see the point. Without distortion, this is ten times as fast.
+    """
     f = np.float32
     fx, fy, cx, cy = f(parameters[0]), f(-parameters[1]), f(parameters[2] - 0.5), f(parameters[3] - 0.5)
     a, b, c = f(w * centre[0]), f(w * centre[1]), f(w * centre[2])
     outside, nearest = f(OUTSIDE_PX), f(-1e-12)
     ray_x, ray_y, ray_z, du, dv = planes[0], planes[1], planes[2], planes[3], planes[4]
-    for row in range(x.shape[0]):
-        for column in range(x.shape[1]):
-            z = ray_z[row, column] + c
+    if code == 0 and not parameters[4:].any():
+        for n in range(len(x)):
+            z = ray_z[n] + c
             q = f(-1) / min(z, nearest)
-            u = fx * (ray_x[row, column] + a) * q + cx + du[row, column]
-            v = fy * (ray_y[row, column] + b) * q + cy + dv[row, column]
-            x[row, column] = u if z < f(0) else outside
-            y[row, column] = v if z < f(0) else outside
+            u, v = fx * (ray_x[n] + a) * q + cx + du[n], fy * (ray_y[n] + b) * q + cy + dv[n]
+            x[n], y[n] = u if z < f(0) else outside, v if z < f(0) else outside
+        return
+    for n in range(len(x)):
+        u, v, front = pixel_of(code, ray_x[n] + a, ray_y[n] + b, ray_z[n] + c, parameters)
+        x[n] = u + du[n] - 0.5 if front else OUTSIDE_PX
+        y[n] = v + dv[n] - 0.5 if front else OUTSIDE_PX
 
 
 @compiled

@@ -24,14 +24,7 @@ from sl_nerfstudio.decoding.grid_fit import (
     shrink,
 )
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.matching.costs import (
-    Statistics,
-    StereoMatches,
-    correlations,
-    image_statistics,
-    match_semi_globally,
-    matching_costs,
-)
+from sl_nerfstudio.matching.costs import Statistics, correlations, image_statistics, matching_costs
 from sl_nerfstudio.matching.lines import (
     OUTSIDE_PX,
     TEAR,
@@ -42,6 +35,8 @@ from sl_nerfstudio.matching.lines import (
     pixels_a_period,
     with_offset,
 )
+from sl_nerfstudio.matching.ranges import TILE, TriedRanges
+from sl_nerfstudio.matching.semi_global import StereoMatches, match_semi_globally
 from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.grid import GridPattern
 
@@ -150,15 +145,17 @@ class LineMatcher:
         period = self.pattern.period
         lines = with_offset(lines, image.coords, period, size)
         decoded = lines.nearest(image.coords)
-        tried = hypotheses(lines, image.coords, decoded, image.mask, period)
-        if tried is None:
+        w = hypotheses(lines, image.coords, decoded, image.mask, period)
+        if w is None:
             return None
+        numbers = numbers_of(decoded, w)
+        tried = TriedRanges.near(numbers, image.mask, len(w))
         sigma = COST_WINDOW * size
         statistics = image_statistics(image.grey, image.decoded, sigma)
         grid = self._sharpness(image, statistics, sigma)
-        matches = self._in_strips(image.grey, statistics, lines, numbers_of(decoded, tried), tried, grid, size)
-        w = tried[0] + matches.index.astype(np.float64) * (tried[1] - tried[0])
-        fitted = LineFit(grid, size).fitted(image.grey, lines, w)
+        matches = self._in_strips(image.grey, statistics, lines, w, tried, numbers, grid, size)
+        matched = w[0] + matches.index.astype(np.float64) * (w[1] - w[0])
+        fitted = LineFit(grid, size).fitted(image.grey, lines, matched)
         correlation = correlations(image.grey, statistics, fitted, grid, sigma)
         features = features_of(matches, fitted, correlation, image.coords, image.mask, period, size)
         return MatchedImage(fitted, features)
@@ -168,23 +165,25 @@ class LineMatcher:
         grey: Float32[ndarray, "h w"],
         statistics: Statistics,
         lines: EpipolarLines,
+        w: Float64[ndarray, "k"],
+        tried: TriedRanges,
         decoded: Int32[ndarray, "h w"],
-        tried: Float64[ndarray, "k"],
         grid: DrawnGrid,
         size: float,
     ) -> StereoMatches:
-        """Strips of rows that overlap, as high as memory allows."""
-        h, w = grey.shape
-        margin = round(STRIP_MARGIN * size)
-        rows = max(MOST_BYTES // (3 * w * len(tried)) - 2 * margin, margin, 1)
-        parts = []
-        for first in range(0, h, rows):
-            begin, end = max(first - margin, 0), min(first + rows + margin, h)
-            some = slice(begin, end)
-            there = statistics[0][some], statistics[1][some]
-            strip, sigma = lines.part((some, slice(None))), COST_WINDOW * size
-            costs = matching_costs(grey[some], there, strip, tried, grid, sigma)
-            parts.append(match_semi_globally(costs, decoded[some]).part(slice(first - begin, first - begin + rows)))
+        """Strips of rows of tiles that overlap, as high as memory allows."""
+        margin, height = -(-round(STRIP_MARGIN * size) // TILE), len(tried.count)
+        parts, first = [], 0
+        while first < height:
+            begin, end = max(first - margin, 0), first + 1
+            while end < height and 3 * tried.part(slice(begin, end + 1 + margin)).cells <= MOST_BYTES:
+                end += 1
+            tiles, rows = tried.part(slice(begin, end + margin)), slice(begin * TILE, (end + margin) * TILE)
+            there, strip = (statistics[0][rows], statistics[1][rows]), lines.part((rows, slice(None)))
+            costs = matching_costs(grey[rows], there, strip, w, tiles, grid, COST_WINDOW * size)
+            matches = match_semi_globally(costs, tiles, decoded[rows])
+            parts.append(matches.part(slice((first - begin) * TILE, (end - begin) * TILE)))
+            first = end
         return StereoMatches.joined(parts)
 
     def _sharpness(self, image: DecodedImage, statistics: Statistics, sigma: float) -> DrawnGrid:
