@@ -36,14 +36,18 @@ def gaussian_means(layers: Float32[ndarray, "k h w 4"], sigma: float) -> Float32
 
 
 def local_planes(
-    coords: Float32[ndarray, "h w 2"], inside: Bool[ndarray, "h w"], sigma: float
+    coords: Float32[ndarray, "h w 2"], weights: Float32[ndarray, "h w"], sigma: float
 ) -> Float32[ndarray, "h w 2"]:
-    """The value at each pixel of the plane that fits the values around it, in a Gaussian window, best."""
+    """The value at each pixel of the plane that fits the values around it, in a Gaussian window, best.
+
+    Values of weight zero may be NaN.
+    """
+    inside = weights > 0
     if not inside.any():
         return np.full_like(coords, np.nan)
     centre = np.nanmean(coords[inside], axis=0)
     products = np.zeros((3, *inside.shape, 4), dtype=np.float32)
-    _multiply(coords, inside, centre, np.float32(sigma), products)
+    _multiply(coords, weights, centre, np.float32(sigma), products)
     out = np.empty_like(coords)
     _evaluate_planes(gaussian_means(products, sigma), centre, np.float32(sigma), out)
     return out
@@ -52,6 +56,7 @@ def local_planes(
 def flattened(
     values: Float32[ndarray, "h w 2"],
     inside: Bool[ndarray, "h w"],
+    weights: Float32[ndarray, "h w"],
     windows: Sequence[tuple[float, float]],
     is_near: Callable[[Float32[ndarray, "h w 2"], float], Bool[ndarray, "h w"]],
 ) -> Float32[ndarray, "h w 2"]:
@@ -60,28 +65,30 @@ def flattened(
     `windows` are standard deviations, in pixels and largest first, each with the limit that `is_near` gets beside the
     plane's distance from the value. In narrow parts, and beside edges that were read without a tear, a window holds
     more than one surface: its plane is of none of them. Outside `inside`, values continue the nearest planes.
+    `weights` are those of the pixels in a plane, zero outside.
     """
     out = values
     for sigma, limit in reversed(windows):
-        plane = local_planes(values, inside, sigma)
+        plane = local_planes(values, weights, sigma)
         near = ~inside | is_near(plane - values, limit)
         out = np.where(near[..., None], plane, out)
     return out
 
 
 @compiled
-def _multiply(coords: ndarray, inside: ndarray, centre: ndarray, sigma: float, out: ndarray) -> None:
-    """Products of one, place and coordinates at the pixels inside: (1, x, y, xx), (xy, yy, u, ux), (uy, v, vx, vy)."""
-    h, w = inside.shape
+def _multiply(coords: ndarray, weights: ndarray, centre: ndarray, sigma: float, out: ndarray) -> None:
+    """Weighted products of one, place and coordinates: (1, x, y, xx), (xy, yy, u, ux), (uy, v, vx, vy)."""
+    h, w = weights.shape
     for row in range(h):
         y = (row - h / 2) / sigma
         for column in range(w):
-            if inside[row, column]:
+            n = weights[row, column]
+            if n > 0:
                 x = (column - w / 2) / sigma
-                u, v = coords[row, column, 0] - centre[0], coords[row, column, 1] - centre[1]
+                u, v = n * (coords[row, column, 0] - centre[0]), n * (coords[row, column, 1] - centre[1])
                 a, b, c = out[0, row, column], out[1, row, column], out[2, row, column]
-                a[0], a[1], a[2], a[3] = 1, x, y, x * x
-                b[0], b[1], b[2], b[3] = x * y, y * y, u, u * x
+                a[0], a[1], a[2], a[3] = n, n * x, n * y, n * x * x
+                b[0], b[1], b[2], b[3] = n * x * y, n * y * y, u, u * x
                 c[0], c[1], c[2], c[3] = u * y, v, v * x, v * y
 
 
@@ -427,4 +434,4 @@ def _smooth(
         return apart[..., 0] ** 2 + apart[..., 1] ** 2 < (limit * period) ** 2
 
     windows = [(window * pixels_a_period, limit) for window, limit in _SMOOTHING]
-    return flattened(coords, inside, windows, is_near)
+    return flattened(coords, inside, inside.astype(np.float32), windows, is_near)

@@ -155,7 +155,7 @@ class LineMatcher:
         grid = self._sharpness(image, statistics, sigma)
         matches = self._in_strips(image.grey, statistics, lines, w, tried, numbers, grid, size)
         matched = w[0] + matches.index.astype(np.float64) * (w[1] - w[0])
-        fitted = LineFit(grid, size).fitted(image.grey, lines, matched)
+        fitted = LineFit(grid, size).fitted(image.grey, lines, matched, image.decoded)
         correlation = correlations(image.grey, statistics, fitted, grid, sigma)
         features = features_of(matches, fitted, correlation, image.coords, image.mask, period, size)
         return MatchedImage(fitted, features)
@@ -227,14 +227,18 @@ class LineFit:
     pixels_a_period: float
 
     def fitted(
-        self, image: Float32[ndarray, "h w"], lines: EpipolarLines, w: Float64[ndarray, "h w"]
+        self,
+        image: Float32[ndarray, "h w"],
+        lines: EpipolarLines,
+        w: Float64[ndarray, "h w"],
+        decoded: Bool[ndarray, "h w"],
     ) -> Float32[ndarray, "h w 2"]:
-        """Coordinates; NaN in small regions."""
+        """Coordinates; NaN in small regions. Only pixels that were `decoded` tell what is flat, and where it is moved."""
         coords = lines.at(w)
         out = np.full_like(coords, np.nan)
         largest, least = TEAR * self.grid.period, LEAST_AREA * self.pixels_a_period**2
         for box, inside in large_regions(coords, largest, least):
-            out[box][inside] = self._region(image[box], lines.part(box), w[box], inside)[inside]
+            out[box][inside] = self._region(image[box], lines.part(box), w[box], inside, decoded[box])[inside]
         return out
 
     def _region(
@@ -243,16 +247,17 @@ class LineFit:
         lines: EpipolarLines,
         w: Float64[ndarray, "h w"],
         inside: Bool[ndarray, "h w"],
+        decoded: Bool[ndarray, "h w"],
     ) -> Float32[ndarray, "h w 2"]:
-        period, size = np.float32(self.grid.period), self.pixels_a_period
-        trust, light = inside.astype(np.float32), GridLight.even(image.shape)
+        period, size, light = np.float32(self.grid.period), self.pixels_a_period, GridLight.even(image.shape)
+        trust = (inside & decoded).astype(np.float32)
         slope = lines.slopes(w)
         steep = np.hypot(slope[..., 0], slope[..., 1])
-        flat = lines.at(self._smooth(w, inside, steep))
+        flat = lines.at(self._smooth(w, inside, trust, steep))
         # Where the image moves the matches, and flat again: steps of the inverse distance leave errors of their own.
         flat = flat + period * fit_shift(image, flat, trust, self.grid, light, size, SHIFT_WINDOW).shift
         light = measure_light(image, flat, trust, self.grid, size)
-        flat = lines.at(self._smooth(lines.nearest(flat), inside, steep))
+        flat = lines.at(self._smooth(lines.nearest(flat), inside, trust, steep))
         direction = slope / np.maximum(steep[..., None], np.float32(1e-12))
         total = np.zeros_like(flat)
         for _ in range(FIT_ROUNDS):
@@ -261,7 +266,11 @@ class LineFit:
         return flat + total * period
 
     def _smooth(
-        self, w: Float64[ndarray, "h w"], inside: Bool[ndarray, "h w"], slope: Float32[ndarray, "h w"]
+        self,
+        w: Float64[ndarray, "h w"],
+        inside: Bool[ndarray, "h w"],
+        trust: Float32[ndarray, "h w"],
+        slope: Float32[ndarray, "h w"],
     ) -> Float64[ndarray, "h w"]:
         """Inverse distances of planes that are near the pixel's own match, along its line."""
         unit = float(np.median(w[inside]))
@@ -272,7 +281,7 @@ class LineFit:
 
         windows = [(window * self.pixels_a_period, limit) for window, limit in SMOOTHING]
         both = np.dstack([scaled, scaled])  # planes are fitted to two values at a time
-        return flattened(both, inside, windows, is_near)[..., 0].astype(np.float64) * unit
+        return flattened(both, inside, trust, windows, is_near)[..., 0].astype(np.float64) * unit
 
 
 @compiled

@@ -7,8 +7,8 @@ import pytest
 
 from sl_nerfstudio.decoding.grid_fit import draw_sharpnesses
 from sl_nerfstudio.matching import matcher
-from sl_nerfstudio.matching.costs import StereoMatches
 from sl_nerfstudio.matching.matcher import FEATURES, RIGHT, DecodedImage, LineFit, LineMatcher, features_of
+from sl_nerfstudio.matching.semi_global import StereoMatches
 from tests.matching.scene import PATTERN, PERIOD, across, step_scene
 
 SIZE = 200 / 15
@@ -91,7 +91,7 @@ def test_large_images_are_matched_on_means_of_squares():
 
 def fitted(scene, start, lines=None):
     grid = draw_sharpnesses(PATTERN.render(), PERIOD)[0]
-    return LineFit(grid, SIZE).fitted(scene.image, lines or scene.lines, start)
+    return LineFit(grid, SIZE).fitted(scene.image, lines or scene.lines, start, np.isfinite(start))
 
 
 def errors(scene, coords):
