@@ -1,7 +1,7 @@
 """Matching costs of image and pattern: correlations in Gaussian windows, at every inverse distance that is tried.
 
-Only the tiles in whose range an inverse distance lies are computed for it. Neighbouring tiles of about the same range are one block,
-with a border of half a window around it, in arrays as small as the processor's nearest memory.
+Tiles that lie side by side and have about the same range are computed together, as a block with half a window around
+it, one inverse distance after the other: all that is needed on the way stays in the processor's nearest memory.
 """
 
 import cv2
@@ -55,11 +55,11 @@ def matching_costs(
 
 
 def _neighbours(picture: Float32[ndarray, "h w"]) -> UInt32[ndarray, "h*w"]:
-    """Each pixel of a picture between 0 and 1, those to the right and below in a byte each: one access gets all four."""
-    bytes_ = np.rint(255 * picture).astype(np.uint32)
-    out = np.zeros_like(bytes_)
-    for shift, (down, right) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
-        out[:-1, :-1] |= bytes_[down:, right:][: out.shape[0] - 1, : out.shape[1] - 1] << np.uint32(8 * shift)
+    """Each pixel of a picture between 0 and 1, and those to the right and below, as bytes: one access gets all four."""
+    values = np.rint(255 * picture).astype(np.uint32)
+    out = values.copy()
+    out[:, :-1] |= values[:, 1:] << np.uint32(8)
+    out[:-1] |= out[1:] << np.uint32(16)
     return out.ravel()
 
 
@@ -114,30 +114,33 @@ def _fill_costs(
     h, w = image.shape
     reach = len(weights) - 1
     most = (TILE + 2 * reach) * (_WIDEST * TILE + 2 * reach)
-    ray, grey, room = np.empty((5, most), np.float32), np.empty((3, most), np.float32), np.empty((10, most), np.float32)
+    ray, grey, room = np.empty((5, most), np.float32), np.empty((3, most), np.float32), np.empty((8, most), np.float32)
     read, inside, costs = np.empty(most, np.uint32), np.empty(most, np.bool_), np.empty(most, np.uint8)
     for a in range(first.shape[0]):
         b = 0
         while b < first.shape[1]:
             end, low, high = _block(first[a], count[a], b, 2 * reach)
             rows, width = min(TILE, h - a * TILE), min(end * TILE, w) - b * TILE + 2 * reach
-            all_, middle, inner = (rows + 2 * reach) * width, rows * width, rows * width - 2 * reach
+            whole, middle, inner = (rows + 2 * reach) * width, rows * width, rows * width - 2 * reach
             corner, begin = (a * TILE - reach, b * TILE - reach), reach * width + reach
             if high > low:
                 for n in range(5):
-                    _cut_out(planes[n], corner, width, ray[n, :all_])
-                _cut_out(image, corner, width, grey[0, :all_])
-                _cut_out(mean, corner, width, grey[1, :all_])
-                _cut_out(scale, corner, width, grey[2, :all_])
-            x, y, drawn, square, product = room[0, :all_], room[1, :all_], room[2, :all_], room[3, :all_], room[4, :all_]
+                    _cut_out(planes[n], corner, width, ray[n, :whole])
+                _cut_out(image, corner, width, grey[0, :whole])
+                _cut_out(mean, corner, width, grey[1, :whole])
+                _cut_out(scale, corner, width, grey[2, :whole])
+            x, y = room[0, :whole], room[1, :whole]
+            drawn, square, product = room[2, :whole], room[3, :whole], room[4, :whole]
             for k in range(low, high):
-                places_on_lines(code, parameters, ray[:, :all_], centre, inverse_distances[k], x, y)
+                places_on_lines(code, parameters, ray, centre, inverse_distances[k], x, y)
                 _draw(words, size, x, y, read, inside, drawn)
                 _multiply(drawn, grey[0], square, product)
                 for n in range(3):
                     _blur(room[2 + n], weights, width, room[5 + n, :middle])
                     _blur(room[5 + n], weights, 1, room[n, :inner])
-                _write(room[0], room[1], room[2], grey[1, begin:], grey[2, begin:], inside[begin:], least, costs[:inner])
+                _write(
+                    room[0], room[1], room[2], grey[1, begin:], grey[2, begin:], inside[begin:], least, costs[:inner]
+                )
                 for tile in range(b, end):
                     n, place = count[a, tile], k - first[a, tile]
                     if 0 <= place < n:
@@ -211,7 +214,7 @@ def _multiply(drawn: ndarray, image: ndarray, square: ndarray, product: ndarray)
 
 @compiled
 def _blur(values: ndarray, weights: ndarray, step: int, out: ndarray) -> None:
-    """Weighted sums of values that are up to `reach` steps before and after; the first is that of the first which has all."""
+    """Weighted sums of values and those some steps before and after; first of the first value that has them all."""
     reach = len(weights) - 1
     middle = values[reach * step :]
     for n in range(len(out)):
@@ -224,14 +227,7 @@ def _blur(values: ndarray, weights: ndarray, step: int, out: ndarray) -> None:
 
 @compiled
 def _write(
-    p: ndarray,
-    pp: ndarray,
-    ip: ndarray,
-    mean: ndarray,
-    scale: ndarray,
-    inside: ndarray,
-    least: float,
-    out: ndarray,
+    p: ndarray, pp: ndarray, ip: ndarray, mean: ndarray, scale: ndarray, inside: ndarray, least: float, out: ndarray
 ) -> None:
     half, one = np.float32(HALF), np.float32(1)
     for n in range(len(out)):

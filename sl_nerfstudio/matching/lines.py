@@ -20,6 +20,7 @@ TEAR = 0.35  # difference between neighbouring pixels that separates surfaces, p
 FEWEST_FOR_SIZE = 100  # pixels from which the size of a period is told
 OUTSIDE_PX = -1e6  # in place of coordinates where nothing is seen
 NEAREST_STEPS = 4  # of Gauss-Newton, to the nearest place on a line
+NEAREST_EXACT = 1e-6  # change of the inverse distance, as a share of it, that is too small for another step
 UNKNOWN = -(2**20)  # far from the number of any inverse distance
 
 # The inverse distances that are tried.
@@ -275,6 +276,9 @@ def _nearest(
                     break
                 du = view[3] * centre[0] + view[4] * centre[1] + view[5] * centre[2]
                 dv = view[6] * centre[0] + view[7] * centre[1] + view[8] * centre[2]
-                s += (du * (u - view[0]) + dv * (v - view[1])) / max(du * du + dv * dv, 1e-300)
+                step = (du * (u - view[0]) + dv * (v - view[1])) / max(du * du + dv * dv, 1e-300)
+                s += step
+                if abs(step) < NEAREST_EXACT * abs(s):
+                    break
             if front and s > 0:
                 out[row, column] = s

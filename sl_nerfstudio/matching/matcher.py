@@ -233,7 +233,7 @@ class LineFit:
         w: Float64[ndarray, "h w"],
         decoded: Bool[ndarray, "h w"],
     ) -> Float32[ndarray, "h w 2"]:
-        """Coordinates; NaN in small regions. Only pixels that were `decoded` tell what is flat, and where it is moved."""
+        """Coordinates; NaN in small regions. Planes and shifts are those of the pixels that were `decoded`."""
         coords = lines.at(w)
         out = np.full_like(coords, np.nan)
         largest, least = TEAR * self.grid.period, LEAST_AREA * self.pixels_a_period**2
@@ -334,7 +334,7 @@ class Logistic:
         return 1 / (1 + np.exp(-odds))
 
 
-RIGHT = Logistic(-3.697, (0.0923, -0.0068, 2.4458, -0.9122, 2.3262, 0.6447, 2.7155, 0.9038))
+RIGHT = Logistic(-4.081, (0.0741, -0.0053, 2.5316, -0.7949, 2.3923, 0.5960, 3.2449, 0.5606))
 
 
 def features_of(

@@ -32,7 +32,9 @@ class StereoMatches:
     index: Float32[ndarray, "h w"]  # its number, with the fraction of a step that a parabola through the sums says;
     # NaN where none was tried
     cost: UInt8[ndarray, "h w"]  # its own, without changes
-    margin: Float32[ndarray, "h w"]  # by how much the sums of the best rival are larger, at most by one change for each way
+    margin: Float32[
+        ndarray, "h w"
+    ]  # by how much the sums of the best rival are larger, at most by one change for each way
 
     def part(self, rows: slice) -> "StereoMatches":
         """The matches of some rows."""
@@ -108,7 +110,11 @@ def _add_ways(
             least_side = _go_on(own, side[(j + 1) % 2], least_side, low - slope, near, away, left)
             for m in range(3):
                 slope = _slope(decoded, row, column, -step, m - 1, steepest)
-                came, least, out = before[m, column + m], least_before[m, column + m], here[m, column + 1, low : low + n]
+                came, least, out = (
+                    before[m, column + m],
+                    least_before[m, column + m],
+                    here[m, column + 1, low : low + n],
+                )
                 least_here[m, column + 1] = _go_on(own, came, least, low - slope, near, away, out)
             _add(left, here[:, column + 1, low : low + n], sums[place : place + n])
         before, here, least_before, least_here = here, before, least_here, least_before

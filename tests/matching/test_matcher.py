@@ -69,7 +69,7 @@ def test_a_wrong_pose_or_hardly_anything_decoded_changes_nothing(scene):
 
 
 def test_strips_give_what_the_whole_gives(monkeypatch, scene, matched):
-    monkeypatch.setattr(matcher, "MOST_BYTES", 200 * 40 * 3 * 120)
+    monkeypatch.setattr(matcher, "MOST_BYTES", 1)  # one row of tiles at a time
     monkeypatch.setattr(matcher, "STRIP_MARGIN", 4.0)
     strips = match(scene, decoded_of(scene))
     both = np.isfinite(strips[..., 0]) & np.isfinite(matched[..., 0])
@@ -144,6 +144,19 @@ def test_noise_is_not_taken_for_detail(monkeypatch, noise, share):
         along, _ = errors(scene, fitted(scene, rough_start(scene)))
         rms.append(np.sqrt((along**2).mean()))
     assert rms[0] < share * rms[1]
+
+
+def test_what_was_not_decoded_has_no_say(scene):
+    """Nor has the image there, as in a shadow; pixels that were decoded keep their coordinates."""
+    decoded = np.ones(scene.image.shape, bool)
+    decoded[40:60] = False
+    grid, start = draw_sharpnesses(PATTERN.render(), PERIOD)[0], rough_start(scene)
+    dark = np.where(decoded, scene.image, np.float32(0.1))
+    both = (scene.image, start), (dark, np.where(decoded, start, moved_start(scene, 2.0)))
+    plain, disturbed = (LineFit(grid, SIZE).fitted(image, scene.lines, w, decoded) for image, w in both)
+    np.testing.assert_allclose(disturbed[decoded], plain[decoded], atol=1e-3)
+    trusting = LineFit(grid, SIZE).fitted(dark, scene.lines, both[1][1], np.ones_like(decoded))
+    assert abs(trusting - plain)[decoded].max() > 0.5
 
 
 def test_small_regions_are_left_out(scene):

@@ -22,13 +22,14 @@ def random_ranges(rng, shape, count):
 
 
 def is_tried(tried, shape, count):
-    first, some = (np.kron(x, np.ones((TILE, TILE), int))[: shape[0], : shape[1], None] for x in (tried.first, tried.count))
+    first, some = (
+        np.kron(x, np.ones((TILE, TILE), int))[: shape[0], : shape[1], None] for x in (tried.first, tried.count)
+    )
     return (np.arange(count) >= first) & (np.arange(count) < first + some)
 
 
 def packed(values, tried):
     """The values of what is tried, as the matching expects them."""
-    h, w, count = values.shape
     out = np.zeros(tried.cells, values.dtype)
     for (a, b), start in np.ndenumerate(tried.start):
         n, first = tried.count[a, b], tried.first[a, b]
