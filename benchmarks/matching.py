@@ -41,7 +41,7 @@ class Row:
     wrong: float  # of the kept ones that are lit
     unlit: float  # of the kept ones where no light falls
     median_px: float
-    cpu_seconds: float  # a frame
+    cpu_seconds: float  # a frame; of the first set of a first run, with compilation
 
 
 def measure(captures: Path, each: int) -> Row:
