@@ -41,7 +41,7 @@ from sl_nerfstudio.relative_pose.estimation import (
 )
 from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError
-from sl_nerfstudio.scan.images import as_grey, read_photograph
+from sl_nerfstudio.scan.images import as_grey
 
 # One frame by itself: decoding, the relative pose of the projector, matching along its lines, triangulation.
 
@@ -63,6 +63,7 @@ class FrameJob:
     cameras: dict[str, Device] = field(default_factory=dict)  # by name, if there are several; `camera` is the first
     stated: StatedSigma = field(default_factory=StatedSigma)  # how uncertain the files say the intrinsics are
     last_step: Step = "match"
+    shrink: int = 1  # by which photographs are shrunk when they are read; cameras and maps are of that size
 
     def camera_of(self, frame: CapturedFrame) -> Device:
         """The camera that took a frame."""
@@ -137,7 +138,7 @@ class FrameWorker:
             decoded = self._store.load(frame, key)
             resumed = decoded is not None
             if decoded is None:
-                decoded = self._store.save(frame, key, self._job.decoder.decode(frame.images))
+                decoded = self._store.save(frame, key, self._decode(frame))
             result = replace(result, key=key, resumed=resumed, notes=decoded.notes)
             result = result.showing(self._selected(frame.name, decoded))
         except FileError as error:
@@ -145,6 +146,10 @@ class FrameWorker:
         except DecodingError as error:
             return result.failed("decoding", self._with_file(frame, error))
         return result if self._job.last_step == "decode" else self._calibrated(result, decoded)
+
+    def _decode(self, frame: CapturedFrame) -> Decoded:
+        images = [frame.read(place) for place in range(len(frame.images))]
+        return self._job.decoder.decode(images, [path.name for path in frame.images])
 
     def calibrate(self, result: FrameStageResult) -> FrameStageResult:
         """The frame with its relative pose and cloud from all decoded coordinates, or left out with the reason."""
@@ -217,7 +222,7 @@ class FrameWorker:
         kept = self._store.load(frame, key)
         if kept is not None:
             return key, kept
-        grey = as_grey(read_photograph(frame.images[0]))
+        grey = as_grey(frame.read(0))
         coords = self._matcher.match(
             DecodedImage(grey, decoded.coords, decoded.mask), *devices, pose.T_camera_projector
         )
@@ -248,15 +253,15 @@ class FrameWorker:
 # Worker processes that end with their parent, whatever ends it, and leave control-C to it.
 
 _EXIT_ORPHANED = 1
-_PROCESS, _PIXEL = 1.4e9, 200  # bytes that decoding a photograph takes: of any size, and for each of its pixels
+_PROCESS, _READ, _PIXEL = 1.4e9, 15, 200  # bytes of a process: always, for each pixel of a photograph, for each decoded
 _MAIN_PROCESS = 1.0e9  # bytes of the process that collects the results, without the clouds that it may keep
 _FOR_PROCESSES = 0.85  # share of the memory that is left to the processes
 
 
-def default_processes(pixels: int, memory: int) -> int:
+def default_processes(pixels: int, memory: int, shrink: int = 1) -> int:
     """One for each core, but not more than `memory` (bytes) is enough for; `pixels` of the largest photograph."""
     room = _FOR_PROCESSES * memory - _MAIN_PROCESS
-    return max(1, min(cores(), int(room / (_PROCESS + _PIXEL * pixels))))
+    return max(1, min(cores(), int(room / (_PROCESS + (_READ + _PIXEL / shrink**2) * pixels))))
 
 
 @contextmanager
@@ -314,7 +319,7 @@ def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) ->
         settings |= {"masks": str(job.masks.folder), "masks_digest": job.masks.digest}
     manifest = Manifest(job.work, settings)
     largest = max((w * h for w, h in captures.sizes.values()), default=0)
-    jobs, clouds = config.jobs or default_processes(largest, memory_of_process()), LargeClouds()
+    jobs, clouds = config.jobs or default_processes(largest, memory_of_process(), job.shrink), LargeClouds()
     with closing(run_frames(job, todo, jobs)) as ready:  # an exception here ends the workers, too
         for result in track(ready, "decoding and calibrating", len(todo)):
             found[result.name] = with_kept_cloud(result, clouds)

@@ -169,6 +169,7 @@ def write_scan(
         units=poses.units,
         scale=poses.scale,
         projector=job.projector,
+        extra={"sl_shrunk_by": job.shrink} if job.shrink > 1 else None,
         projector_extra=None if result.projector is None else {"intrinsics_sigma": result.projector.sigmas()},
         pattern=np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8),
         camera=job.camera,
@@ -190,7 +191,7 @@ def write_scan(
                 coords=np.where(keep[..., None], cloud.coords, np.float32(np.nan)),
                 mask=decoded.mask & keep,
                 pattern=np.rint(255 * decoded.pattern * keep).astype(np.uint8),
-                color=None if picture is None else read_photograph(picture),
+                color=None if picture is None else read_photograph(picture, job.shrink),
                 image_is_color=white is not None and not pictures,
                 camera=job.camera_of(frame.frame) if job.cameras else None,
                 T_world_camera=poses.adjusted.poses.T_world_camera[k],
@@ -205,7 +206,7 @@ def write_scan(
 def _image(frame: FrameStageResult, shown: int) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None:
     """The capture (of a sequence the image in full light, by its place); None if it cannot be read."""
     try:
-        return read_photograph(frame.frame.images[shown])
+        return frame.frame.read(shown)
     except (FileError, IndexError):
         return None
 

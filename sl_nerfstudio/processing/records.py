@@ -41,7 +41,7 @@ class DecodedStore:
 
     def key(self, frame: CapturedFrame) -> str:
         """Digest of the images' contents and of the decoder. Raises FileError if an image cannot be read."""
-        digest = hashlib.sha256(self._decoder_key.encode())
+        digest = hashlib.sha256(f"{self._decoder_key} {frame.shrink}".encode())
         for path in frame.images:
             digest.update(hashlib.sha256(read_bytes(path)).digest())
         return digest.hexdigest()[:KEY_LENGTH]

@@ -41,7 +41,7 @@ from tests.processing.ramp_scan import LAYOUT, NAMES, RampScan
 class KilledDecoder(RampsDecoder):
     """As if the system had run out of memory."""
 
-    def decode(self, paths):
+    def decode(self, images, names):
         os._exit(9)
 
 
