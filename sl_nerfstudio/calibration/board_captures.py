@@ -112,7 +112,7 @@ def _read_pose(
         images += [read_photograph(path) for path in pose.images]
     else:
         white = without_reflectance(pattern, grey)
-        factor = decoder.shrink_factor(white)
+        factor = decoder.shrink_factor(white) or 1
         images.append(shrunk(white, factor))
     try:
         decoded = decoder.decode(images, [path.name for path in pose.images])

@@ -165,8 +165,11 @@ class Decoder(ABC, Generic[L]):
         Raises DecodingError for a capture that cannot be decoded.
         """
 
-    def shrink_factor(self, image: Pixels) -> int:
-        """By how much a photograph can be shrunk before it is decoded; 1, as here: every pixel is needed."""
+    def shrink_factor(self, image: Pixels) -> int | None:
+        """By how much a photograph can be shrunk before it is decoded; None where it does not show the pattern.
+
+        1, as here: every pixel is needed.
+        """
         return 1
 
     @property

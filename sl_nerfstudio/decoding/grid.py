@@ -18,6 +18,8 @@ from sl_nerfstudio.decoding.grid_graph import symbol_log_ratio
 from sl_nerfstudio.decoding.grid_phases import (
     LEAST_MASK,
     map_from_pixels,
+    measure_appearance,
+    node_places,
     sample_pixels,
     spread,
     to_pattern,
@@ -87,8 +89,8 @@ class GridImageDecoder:
             raise refusal(grey, found, self._detector, self.pattern)
         return found
 
-    def shrink_factor(self, image: Pixels) -> int:
-        """By how much a photograph can be shrunk and still have `_FINEST` pixels a period; 1 where no grid is found.
+    def shrink_factor(self, image: Pixels) -> int | None:
+        """By how much a photograph can be shrunk and still have `_FINEST` pixels a period; None where no grid is found.
 
         The grid is looked for in a small copy, and in larger ones as long as its lines may be too fine for that.
         """
@@ -98,9 +100,11 @@ class GridImageDecoder:
         while factor >= 1:
             found = self._detector.detect(as_grey(shrunk(image, factor)))
             if found is not None and found.known >= LEAST_NODES:
-                return max(1, int(factor * found.appearance.period / _FINEST))
+                nodes = node_places(found.maps, found.graph, found.assignment.known)
+                measured = measure_appearance(found.maps, found.appearance, nodes) or found.appearance
+                return max(1, int(factor * measured.period / _FINEST))
             factor //= 2
-        return 1
+        return None
 
     def examine(self, grey: Float32[ndarray, "h w"], found: DetectedGrid) -> EdgeEvidence:
         """Coordinates of all pixels that a node reaches, and what tells the right ones from the wrong ones."""
@@ -169,7 +173,7 @@ class NetworkDecoder(Decoder[GridPattern]):
         """Decode the one image of a frame."""
         return self.images.decode(images[0])
 
-    def shrink_factor(self, image: Pixels) -> int:
+    def shrink_factor(self, image: Pixels) -> int | None:
         """The factor that leaves enough pixels a period."""
         return self.images.shrink_factor(image)
 

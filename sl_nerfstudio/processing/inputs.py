@@ -351,7 +351,7 @@ def shrink_factor(captures: Captures, decoder: Decoder[Any], work: Path) -> int:
         for frame in looked_at:
             with suppress(FileError):  # said when the frame is decoded
                 found.append(decoder.shrink_factor(read_photograph(frame.images[0])))
-        return min(found, default=1)
+        return min((factor for factor in found if factor is not None), default=1)
 
     return StageStore(work).kept("size of photographs", inputs, measure)
 
@@ -479,28 +479,33 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     known = None if config.known_length is None else parse_known_length(config.known_length)
     captured = read_captured(config)
     decoder, captures = captured.decoder, captured.captures
-    shrink = 1 if config.full_size else shrink_factor(captures, decoder, config.work_folder)
-    captures, layout = captures.shrunk(shrink), decoder.layout
+    layout = decoder.layout
     names = [frame.name for frame in captures.frames]
     require_intrinsics(config, projector_needed=not config.finds_projector)
-    cameras = read_cameras(config, captures).shrunk(shrink)
+    cameras = read_cameras(config, captures)
     require_known_camera(config, cameras)
     projector, stated = read_projector(config, (layout.w, layout.h))
     sizes = {frame.name: captures.sizes[frame.camera] for frame in captures.frames}
-    masks = None if config.masks is None else find_masks(config.masks, sizes, shrink)
+    masks = None if config.masks is None else find_masks(config.masks, sizes)
     pictures = {} if config.color is None else find_pictures(config.color, captures)
-    said = (_shrunk_sentence(captures, shrink),) if shrink > 1 else ()
-    said += picture_sentences(pictures, captures) if pictures else ()
+    said = picture_sentences(pictures, captures) if pictures else ()
     doubt = StatedSigma(cameras.sigma, read_projector_sigma(config, (layout.w, layout.h)) if stated else CERTAIN)
     last_step = "decode" if config.finds_projector else "match" if cameras.start is None else "calibrate"
+    given = None if config.poses is None else read_given_poses(config.poses, names)
+    known = None if known is None else frames_by_name(known, names)
+    # Everything that was given fits together: now photographs are read.
+    shrink = 1 if config.full_size else shrink_factor(captures, decoder, config.work_folder)
+    cameras, captures = cameras.shrunk(shrink), captures.shrunk(shrink)
+    said = ((_shrunk_sentence(captures, shrink),) if shrink > 1 else ()) + said
+    masks = None if masks is None else replace(masks, shrink=shrink)
     devices = cameras.first, projector
     return Inputs(
         FrameJob(config.work_folder, decoder, *devices, config.seed, masks, cameras.several, doubt, last_step, shrink),
         cameras,
         captures,
         stated,
-        None if config.poses is None else read_given_poses(config.poses, names),
-        None if known is None else frames_by_name(known, names).shrunk(shrink),
+        given,
+        None if known is None else known.shrunk(shrink),
         replace(captured.notes, sentences=(*captured.notes.sentences, *said), shrink=shrink),
         pictures,
     )

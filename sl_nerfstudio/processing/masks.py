@@ -103,12 +103,8 @@ class UserMasks:
     digests: dict[str, str]
     shrink: int = 1  # by which the captures are shrunk when they are read
 
-    def applied(self, frame: str, decoded: Decoded) -> Decoded:
-        """A decoded frame without what is outside its mask.
-
-        Stored frames are not masked, so that other masks need no decoding. Raises DecodingError if nothing decoded is
-        inside the mask, UserError if the mask is another one than at the start of the run.
-        """
+    def of(self, frame: str) -> Bool[ndarray, "h w"]:
+        """The mask of a frame as its capture is read. Raises UserError if it is another one than at the beginning."""
         path = self.files[frame]
         mask = read_mask(path, self.sizes[frame])
         if _digest(mask) != self.digests[frame]:
@@ -116,7 +112,15 @@ class UserMasks:
                 f"{path}: was changed while sl-process was running\n    cause:  another program wrote it\n"
                 "    remedy: start again; decoded frames are kept"
             )
-        mask = shrunk(255 * mask.astype(np.uint8), self.shrink) >= 128
+        return shrunk(255 * mask.astype(np.uint8), self.shrink) >= 128
+
+    def applied(self, frame: str, decoded: Decoded) -> Decoded:
+        """A decoded frame without what is outside its mask.
+
+        Stored frames are not masked, so that other masks need no decoding. Raises DecodingError if nothing decoded is
+        inside the mask, UserError if the mask is another one than at the start of the run.
+        """
+        path, mask = self.files[frame], self.of(frame)
         if not (decoded.decoded & mask).any():
             raise DecodingError(
                 f"no decoded pixel is inside its mask, {path}", "the mask belongs to another frame, or is inverted",

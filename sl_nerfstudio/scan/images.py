@@ -24,6 +24,7 @@ from PIL.PngImagePlugin import PngImageFile
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.scan.document import FileError, check_file, read_bytes, unreadable
+from sl_nerfstudio.storage import encode_npz
 
 # Images of a scan: grey or RGB, 8 or 16 bit.
 
@@ -482,9 +483,7 @@ def read_coords(path: Path) -> Float32[ndarray, "h w 2"]:
 
 def encode_coords(coords: Float32[ndarray, "h w 2"]) -> bytes:
     """A compressed .npz file of the coordinates."""
-    buffer = BytesIO()
-    np.savez_compressed(buffer, **{KEY: coords})
-    return buffer.getvalue()
+    return encode_npz({KEY: coords})
 
 
 @contextmanager

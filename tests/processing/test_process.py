@@ -3,7 +3,7 @@
 import inspect
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import astuple, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -350,7 +350,8 @@ def test_photographs_that_are_shrunk_give_the_same_scan_at_another_size(ramp_sca
     small = read_scan(config.output)
     assert "392 x 391 pixels are read as 130 x 130" in log[1] and "--full-size" in log[1]
     assert result.captured.shrink == factor
-    assert check_scan(config.output) == [] and small.shrunk_by == factor and small.frames[0].camera == ramp_scan.camera
+    assert check_scan(config.output) == [] and small.shrunk_by == factor
+    assert astuple(small.frames[0].camera)[:-1] == pytest.approx(astuple(ramp_scan.camera)[:-1])
     for one, other in zip(small.frames, scan.frames, strict=True):
         np.testing.assert_array_equal(one.read_image(), other.read_image())
         np.testing.assert_array_equal(one.read_coords()[3:], other.read_coords()[3:])
