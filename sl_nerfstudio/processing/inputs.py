@@ -166,7 +166,7 @@ def refine_camera(
         ]
     if found is None:
         raise ValueError("no frame has a pose")
-    notes = CameraNotes(start, replace(found, camera=found.camera.scaled(job.shrink)))
+    notes = CameraNotes(start, replace(found, camera=found.camera.scaled(float(job.shrink))))
     log(notes.sentence())
     return replace(refined, last_step="match"), again, notes
 

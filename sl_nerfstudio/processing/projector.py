@@ -111,7 +111,7 @@ def doubt_sentence(found: ProjectorEstimate) -> str:
 def wrong_intrinsics(evidence: IntrinsicsEvidence, shrink: int = 1) -> str:
     """Which intrinsics the frames contradict, and the values with which they agree: of photographs before `shrink`."""
     found = [
-        replace(one, device=one.device.scaled(shrink)) if one.role == "camera" else one
+        replace(one, device=one.device.scaled(float(shrink))) if one.role == "camera" else one
         for one in evidence.explanations()
     ]
     chi_square = min(evidence.projector.chi_square, evidence.camera.chi_square)

@@ -505,7 +505,9 @@ def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames
     clouds = clouds_of(results)
     if adjusted is None or not clouds or repeat_each_other(adjusted.poses, clouds):
         return ""
-    cameras = [cloud.camera.scaled(result.frame.shrink) for result in results if (cloud := result.cloud) is not None]
+    cameras = [
+        cloud.camera.scaled(float(result.frame.shrink)) for result in results if (cloud := result.cloud) is not None
+    ]
     return contradiction(adjusted.intrinsics, cameras, clouds[0].projector)
 
 

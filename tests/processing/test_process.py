@@ -334,7 +334,7 @@ def test_photographs_that_are_shrunk_give_the_same_scan_at_another_size(ramp_sca
     for name in NAMES:
         write_atomic(large / "masks" / f"{name}.png", encode_png(mask))
         write_atomic(large / "colours" / f"{name}.png", encode_png(np.dstack([mask // 2] * 3)))
-    camera = replace(ramp_scan.camera.scaled(factor), w=w, h=h)
+    camera = replace(ramp_scan.camera.scaled(float(factor)), w=w, h=h)
     document = {"camera": device_fields(camera, "model"), "projector": device_fields(ramp_scan.projector, "model")}
     (large / "intrinsics.json").write_text(json.dumps(document))
     (large / "pattern.json").write_bytes(LAYOUT.encode())
