@@ -17,7 +17,7 @@ from numpy import ndarray
 from sl_nerfstudio.decoding.decoder import large_regions
 from sl_nerfstudio.parallel import compiled
 
-# Gaussian means, local planes and changes of resolution for images with unknown parts.
+# Gaussian means and local planes for images with unknown parts.
 
 _REACH = 2.5  # of a Gaussian window, standard deviations
 
@@ -113,14 +113,6 @@ def _evaluate_planes(means: ndarray, centre: ndarray, sigma: float, out: ndarray
                 cx, cy = vx - mean * mx, vy - mean * my
                 slope_x, slope_y = (syy * cx - sxy * cy) / determinant, (sxx * cy - sxy * cx) / determinant
                 out[row, column, axis] = centre[axis] + mean + slope_x * (x - mx) + slope_y * (y - my)
-
-
-def shrink(stack: Float32[ndarray, "h w k"], size: tuple[int, int], step: int) -> Float32[ndarray, "a b k"]:
-    """Means over squares of `step` pixels; the image continues with zeros where the last squares need it."""
-    h, w = stack.shape[:2]
-    full = cv2.copyMakeBorder(np.ascontiguousarray(stack), 0, size[1] * step - h, 0, size[0] * step - w,
-                              cv2.BORDER_CONSTANT)  # fmt: skip
-    return np.atleast_3d(cv2.resize(full, size, interpolation=cv2.INTER_AREA))
 
 
 def enlarge(stack: Float32[ndarray, "a b k"], shape: tuple[int, ...], step: int) -> Float32[ndarray, "h w k"]:
@@ -330,9 +322,6 @@ def _solve(means: ndarray, pixels: float, out: ndarray) -> None:
 # Regions.
 _TEAR = 0.35  # periods between neighbouring pixels
 _LEAST_AREA = 1.0  # smaller regions are left out, periods squared
-# Resolution.
-_FINEST = 12.0  # pixels per period: finer captures are averaged first
-_LEAST_INSIDE = 0.3  # share of the averaged pixels that must be in the region
 # Iteration.
 _WINDOW = 0.42  # of a shift, periods
 _ROUNDS = 6  # each recovers a part of the detail that the window of the fit averages over
@@ -355,43 +344,11 @@ def fit_densely(
     """
     out = np.full_like(coords, np.nan)
     agreement = np.zeros(image.shape, dtype=np.float32)
-    factor = max(1, int(pixels_a_period / _FINEST))
     least = _LEAST_AREA * pixels_a_period**2
     for box, inside in large_regions(coords, _TEAR * grids[0].period, least):
-        coarse = _coarser(image[box], coords[box], trust[box] * inside, inside, factor)
-        values, fit = _refine(*coarse, grids, pixels_a_period / factor)
-        values, fit = _finer(values, inside.shape, factor), _finer(fit, inside.shape, factor)
+        values, fit = _refine(image[box], coords[box], trust[box] * inside, inside, grids, pixels_a_period)
         out[box][inside], agreement[box][inside] = values[inside], fit[inside]
     return out, agreement
-
-
-def _coarser(
-    image: Float32[ndarray, "h w"],
-    coords: Float32[ndarray, "h w 2"],
-    trust: Float32[ndarray, "h w"],
-    inside: Bool[ndarray, "h w"],
-    factor: int,
-) -> tuple[Float32[ndarray, "a b"], Float32[ndarray, "a b 2"], Float32[ndarray, "a b"], Bool[ndarray, "a b"]]:
-    """Means over squares of `factor` pixels: faster for fine captures, and as accurate."""
-    if factor == 1:
-        return image, coords, trust, inside
-    h, w = inside.shape
-    size = (-(-w // factor), -(-h // factor))
-    weight = inside.astype(np.float32)
-    values = np.where(inside[..., None], coords, 0)
-    mean = shrink(np.dstack([weight, image * weight, values, trust]).astype(np.float32), size, factor)
-    known = np.maximum(mean[..., :1], 1e-6)
-    mean[..., 1:] /= known
-    covered = mean[..., 0] > _LEAST_INSIDE
-    return mean[..., 1].copy(), mean[..., 2:4].copy(), mean[..., 4] * covered, covered
-
-
-def _finer(values: Float32[ndarray, "a b *c"], shape: tuple[int, ...], factor: int) -> Float32[ndarray, "h w *c"]:
-    """Bilinear values at the pixels that `_coarser` averaged."""
-    if factor == 1:
-        return values
-    size = values.shape[1] * factor, values.shape[0] * factor
-    return cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
 
 
 def _refine(

@@ -6,12 +6,10 @@ Lengths in an image are in periods of the pattern as it appears there.
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.grid_edges import slopes
 from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of, ray_of, view_of
 from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.grid import gaussian_window
@@ -155,32 +153,6 @@ def pixels_a_period(coords: Float32[ndarray, "h w 2"], period: float) -> float |
     area = np.abs(by_x[..., 0] * by_y[..., 1] - by_x[..., 1] * by_y[..., 0])[smooth]
     area = area[area > 0]
     return period / float(np.sqrt(np.median(area))) if len(area) >= FEWEST_FOR_SIZE else None
-
-
-def enlarged(
-    coords: Float32[ndarray, "a b 2"], factor: int, shape: tuple[int, int], period: float
-) -> Float32[ndarray, "h w 2"]:
-    """Coordinates at the pixels of an image of the given shape; those given are at squares of `factor` of its pixels.
-
-    Bilinear within a surface; at its border, the square's plane is continued. NaN where a pixel's square has none.
-    """
-    if factor == 1:
-        return coords
-    h, w = shape
-    size = coords.shape[1] * factor, coords.shape[0] * factor
-    near = np.repeat(np.repeat(coords, factor, axis=0), factor, axis=1)
-    slope = np.repeat(np.repeat(slopes(coords, period), factor, axis=0), factor, axis=1)
-    place = ((np.arange(factor) + 0.5) / factor - 0.5).astype(np.float32)
-    x, y = np.tile(place, coords.shape[1])[None, :, None], np.tile(place, coords.shape[0])[:, None, None]
-    plane = near + slope[..., 0] * x + slope[..., 1] * y
-    linear = cv2.resize(coords, size, interpolation=cv2.INTER_LINEAR)  # NaN beside what is unknown
-    smooth = np.abs(linear - near).max(-1, keepdims=True) < TEAR * period
-    half = factor // 2  # beside the image's border, where interpolation has one side only
-    smooth[:half], smooth[-half:], smooth[:, :half], smooth[:, -half:] = False, False, False, False
-    whole = np.where(smooth, linear, np.where(np.isfinite(plane), plane, near))
-    out = np.full((h, w, 2), np.nan, dtype=np.float32)
-    out[: size[1], : size[0]] = np.where(np.isfinite(near), whole, np.float32(np.nan))
-    return out
 
 
 @compiled

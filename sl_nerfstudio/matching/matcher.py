@@ -4,7 +4,7 @@ Inverse distances are matched semi-globally; the matches are fitted to the image
 of each says how probable it is that it is right.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -21,7 +21,6 @@ from sl_nerfstudio.decoding.grid_fit import (
     fit_shift,
     flattened,
     measure_light,
-    shrink,
 )
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.matching.costs import Statistics, correlations, image_statistics, matching_costs
@@ -29,7 +28,6 @@ from sl_nerfstudio.matching.lines import (
     OUTSIDE_PX,
     TEAR,
     EpipolarLines,
-    enlarged,
     hypotheses,
     numbers_of,
     pixels_a_period,
@@ -41,7 +39,6 @@ from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.grid import GridPattern
 
 COST_WINDOW = 0.14  # standard deviation of the window of correlations, periods
-FINEST = 12.0  # pixels per period: finer captures are averaged first
 MOST_BYTES = 2**28  # memory for costs; larger images are matched in strips
 STRIP_MARGIN = 6.0  # by which strips overlap on each side, periods
 
@@ -82,15 +79,6 @@ class DecodedImage:
         """The pixels in a box."""
         return DecodedImage(*(np.ascontiguousarray(one[box]) for one in (self.grey, self.coords, self.mask)))
 
-    def shrunk(self, factor: int) -> "DecodedImage":
-        """Squares of `factor` pixels as one: means of the image, and what the pixel in their middle has."""
-        if factor == 1:
-            return self
-        h, w = self.mask.shape[0] // factor, self.mask.shape[1] // factor
-        grey = shrink(self.grey[: h * factor, : w * factor, None], (w, h), factor)[..., 0]
-        middle = (slice(factor // 2, h * factor, factor), slice(factor // 2, w * factor, factor))
-        return DecodedImage(grey, np.ascontiguousarray(self.coords[middle]), np.ascontiguousarray(self.mask[middle]))
-
 
 @dataclass(frozen=True)
 class MatchedImage:
@@ -117,18 +105,12 @@ class LineMatcher:
         size = pixels_a_period(image.coords, period)
         if size is None:
             return image.coords
-        factor = max(1, int(size / FINEST))
-        small = image.shrunk(factor)
-        h, w = small.mask.shape
-        lines = EpipolarLines.of(replace(camera.scaled(1 / factor), w=w, h=h), projector, T_camera_projector)
-        matched = self.matched(small, lines, size / factor)
-        if matched is None or not self._agrees(small, matched):
+        matched = self.matched(image, EpipolarLines.of(camera, projector, T_camera_projector), size)
+        if matched is None or not self._agrees(image, matched):
             return image.coords
         right = RIGHT.probability(matched.features) > LEAST_PROBABILITY
         kept = np.where(right[..., None], matched.coords, np.float32(np.nan))
-        least = round(SMALLEST_REGION * (size / factor) ** 2)
-        kept = drop_small_regions(kept, REGION_TEAR * period, least)
-        return enlarged(kept, factor, (image.mask.shape[0], image.mask.shape[1]), period)
+        return drop_small_regions(kept, REGION_TEAR * period, round(SMALLEST_REGION * size**2))
 
     def matched(self, image: DecodedImage, lines: EpipolarLines, size: float) -> MatchedImage | None:
         """Matches of all pixels; `size` is that of a period in the image. None where nothing that was decoded fits."""

@@ -28,13 +28,14 @@ from sl_nerfstudio.storage import locked, read_checked, remove_partial, write_ch
 T = TypeVar("T")
 
 VERSIONS = {
+    "size of photographs": 1,  # decoding/grid.py, `shrink_factor`
     "matching": 2,  # along epipolar lines: matching/
     "calibration": 1,  # the relative pose of a frame: relative_pose/ without the two below
     "projector": 1,  # estimated intrinsics: relative_pose/unknown_projector.py
     "test of intrinsics": 1,  # relative_pose/intrinsics.py
     "static projector": 1,  # registration/static_projector.py
-    "registration": 1,  # registration/
-    "adjustment": 2,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
+    "registration": 2,  # registration/
+    "adjustment": 3,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
 }
 """Number of each stage. Raise it whenever the stage, or anything that it calls, may give another result from the same
 inputs: another algorithm, constant, order of summation or field of a result. Names, comments and speed need none.

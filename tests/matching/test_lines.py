@@ -8,14 +8,7 @@ import torch
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.lie import exp_se3, inverse, transform
-from sl_nerfstudio.matching.lines import (
-    EpipolarLines,
-    enlarged,
-    hypotheses,
-    pixels_a_period,
-    places_on_lines,
-    with_offset,
-)
+from sl_nerfstudio.matching.lines import EpipolarLines, hypotheses, pixels_a_period, places_on_lines, with_offset
 from tests.matching.scene import PERIOD, across, step_scene
 
 CAMERA = Device(w=40, h=30, fl_x=90.0, fl_y=92.0, cx=19.0, cy=16.0, k1=-0.1, k2=0.02, p1=0.002, p2=-0.001)
@@ -121,23 +114,3 @@ def test_the_size_of_a_period_is_measured(pixels):
     coords[30:50] = np.nan
     assert pixels_a_period(coords, PERIOD) == pytest.approx(pixels, rel=1e-3)
     assert pixels_a_period(np.full_like(coords, np.nan), PERIOD) is None
-
-
-@pytest.mark.parametrize("factor", [1, 2, 3])
-def test_coordinates_are_enlarged_exactly_where_surfaces_are_flat(factor):
-    """Also beside a jump, where what lies beyond must not be mixed in; pixels beyond the last square are unknown."""
-    h, w = 61, 47
-    y, x = np.mgrid[:h, :w] + 0.5
-    fine = np.stack([1.3 * x + 0.2 * y, 0.9 * y - 0.1 * x], -1)
-    fine[:, 24:] += 300.0
-    middle = (slice(0, h // factor * factor), slice(0, w // factor * factor))
-    coarse = fine[middle].reshape(h // factor, factor, w // factor, factor, 2).mean((1, 3)).astype(np.float32)
-    coarse[3, 4] = np.nan
-    out = enlarged(coarse, factor, (h, w), PERIOD)
-    known = np.isfinite(out[..., 0])
-    assert not known[3 * factor : 4 * factor, 4 * factor : 5 * factor].any()
-    assert not known[h // factor * factor :].any() and not known[:, w // factor * factor :].any()
-    split = 24 // factor * factor
-    whole = known.copy()
-    whole[:, split : split + factor] &= 24 % factor == 0  # squares on both sides of the jump
-    np.testing.assert_allclose(out[whole], fine[whole], atol=1e-3)
