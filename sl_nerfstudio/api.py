@@ -12,9 +12,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.console import say
 from sl_nerfstudio.decoding.decoder import Decoded
-from sl_nerfstudio.decoding.decoders import DECODERS, choose_decoder
-from sl_nerfstudio.decoding.gray_code import check_count, check_sizes, decode_gray_code
-from sl_nerfstudio.decoding.grid import NetworkDecoder
+from sl_nerfstudio.decoding.decoders import choose_decoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
@@ -22,7 +20,6 @@ from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties
 from sl_nerfstudio.meshing.uncertainty import vertex_uncertainty
 from sl_nerfstudio.pattern.files import read_layout
-from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import PatternLayout
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.process import process
@@ -30,6 +27,7 @@ from sl_nerfstudio.processing.result import ProcessResult
 from sl_nerfstudio.runs.export import build_surface
 from sl_nerfstudio.runs.export_settings import ExportSettings
 from sl_nerfstudio.runs.run import TrainedRun
+from sl_nerfstudio.scan.images import read_photograph
 from sl_nerfstudio.scan.write import device_fields, encode_json
 from sl_nerfstudio.storage import write_atomic
 
@@ -46,6 +44,7 @@ def decode_image(
             Gray code one for each image of the sequence, in its order.
         pattern: what was projected: a layout, or its pattern.json.
 
+    Every pixel is decoded, which takes a minute for 24 million of them; 12 pixels a period of the pattern are enough.
     Returns coordinates (h, w, 2) in projector pixels, NaN where they are not known, the mask (h, w) that the pattern
     lights, and the normalised pattern (h, w). Raises UserError for files that cannot be read, and DecodingError, one
     of those, for a capture in which the pattern is not found.
@@ -59,14 +58,9 @@ def decode_image(
             f"{len(captures)} images of {layout.description}, which a single one shows\n"
             "    remedy: decode them one by one"
         )
-    if not isinstance(captures[0], ndarray):
-        return decoder.decode([Path(one) for one in captures])  # type: ignore[arg-type]
-    if isinstance(decoder, NetworkDecoder):
-        return decoder.decode_image(captures[0])
-    assert isinstance(layout, GrayCode), DECODERS
-    check_count(len(captures), layout)
-    check_sizes(captures)  # type: ignore[arg-type]
-    return decode_gray_code(captures, layout)  # type: ignore[arg-type]
+    names = [f"image {k}" if isinstance(one, ndarray) else Path(one).name for k, one in enumerate(captures)]
+    images = [one if isinstance(one, ndarray) else read_photograph(Path(one)) for one in captures]
+    return decoder.decode(images, names)
 
 
 def triangulate_pixels(

@@ -1,6 +1,7 @@
 """What this process may use of the machine, and work on many pieces side by side on all threads."""
 
 import ctypes
+import fcntl
 import inspect
 import itertools
 import math
@@ -8,6 +9,7 @@ import mmap
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -232,7 +234,68 @@ def split(n: int, parts: int, multiple: int) -> list[tuple[int, int]]:
     return [(start, min(start + step, n)) for start in range(0, max(n, 1), step)]
 
 
-# Machine code for loops that numpy cannot express; kept on disk, so that it is made once.
+# Machine code for loops that numpy cannot express; kept on disk, and made by one process while the others wait for it.
+#
+# numba alone lets all make it at once. Its list of a function's code then names a file that another process has not yet
+# replaced: code for other arguments or of an earlier version, which ends the process with signal 11.
+
+_SAID_AGAIN = 600.0  # seconds after which another process may say that it compiles
+
+
+class _OneAtATime:
+    """Held by the process, and there by the thread, that reads or makes machine code; a function may need others'."""
+
+    def __init__(self, *folders: Path) -> None:
+        """`folders`: the lock is a file in the first that can be written to."""
+        self._folders, self._thread, self._depth, self._file = folders, threading.RLock(), 0, -1
+
+    def __enter__(self) -> "_OneAtATime":
+        """Wait until no other process holds it. One that ends, however it ends, holds it no longer."""
+        self._thread.acquire()
+        self._depth += 1
+        for folder in self._folders if self._depth == 1 else ():
+            with suppress(OSError):
+                folder.mkdir(parents=True, exist_ok=True)
+                self._file = os.open(folder / ".compiling", os.O_RDWR | os.O_CREAT, 0o666)
+                fcntl.flock(self._file, fcntl.LOCK_EX)
+                break
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let others in."""
+        self._depth -= 1
+        if self._depth == 0 and self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+        self._thread.release()
+
+    def say(self) -> None:
+        """Tell who watches why it takes so long; one process does for all."""
+        if self._file < 0 or not sys.stderr.isatty():
+            return
+        told = os.stat(self._file)
+        if not told.st_size or time.time() - told.st_mtime > _SAID_AGAIN:
+            os.pwrite(self._file, b"said", 0)
+            print("compiling for this machine: a minute or two, once", file=sys.stderr, flush=True)
+
+
+_compiling = _OneAtATime(Path(__file__).parent / "__pycache__", Path.home() / ".cache" / "sl-nerfstudio")
+
+
+def shared(dispatcher: Any) -> Any:
+    """A numba function whose code is read, or made and written, by one process at a time."""
+    read_or_make = dispatcher.compile
+
+    def alone(signature: Any) -> Any:
+        with _compiling:
+            made = read_or_make(signature)
+            if dispatcher.stats.cache_misses:
+                _compiling.say()
+            return made
+
+    dispatcher.compile = alone
+    return dispatcher
+
 
 _njit: Any = numba.njit  # its overloads do not accept options in a set
 ANY_ORDER = {"contract", "reassoc", "nsz"}
@@ -245,12 +308,12 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     Other threads run beside it. Division by zero gives infinity or NaN: a check of every divisor would keep loops from
     working on several numbers at once.
     """
-    return numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function))
+    return shared(numba.njit(cache=True, nogil=True, error_model="numpy")(inspect.unwrap(function)))
 
 
 def compiled_sums(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function compiled for one thread, with sums in any order: so several numbers are added at once."""
-    return _njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)(inspect.unwrap(function))
+    return shared(_njit(cache=True, nogil=True, error_model="numpy", fastmath=ANY_ORDER)(inspect.unwrap(function)))
 
 
 def compiled_range(function: Callable[..., None]) -> Callable[..., None]:

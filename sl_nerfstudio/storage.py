@@ -14,10 +14,12 @@ import re
 import socket
 import sys
 import tempfile
+import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
+from io import BytesIO
 from pathlib import Path, PurePosixPath
 from types import TracebackType
 from typing import IO
@@ -391,6 +393,16 @@ def read_checked(path: Path) -> bytes | None:
         return None
     content, digest = stored[:-_LENGTH], stored[-_LENGTH:]
     return content if hashlib.sha256(content).digest() == digest else None
+
+
+def encode_npz(arrays: Mapping[str, ndarray]) -> bytes:
+    """An .npz file of arrays without objects, compressed as fast as can be: harder takes five times as long for 5 %."""
+    buffer = BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, array, allow_pickle=False)
+    return buffer.getvalue()
 
 
 # A new folder that is complete or not there at all, whatever ends the process that fills it.

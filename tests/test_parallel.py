@@ -3,6 +3,7 @@
 import mmap
 import os
 import resource
+import subprocess
 import sys
 import threading
 import time
@@ -267,3 +268,42 @@ def test_the_system_is_told_how_mapped_memory_is_read(tmp_path: Path) -> None:
     assert "rr" not in flags()
     read_at_random(array.ctypes.data, 0)
     assert "rr" not in flags()
+
+
+def test_machine_code_is_read_or_made_by_one_process_at_a_time(tmp_path: Path) -> None:
+    """Two objects stand for two processes: locks belong to open files. The first may be held again by its thread."""
+    (tmp_path / "file").write_text("")
+    one, other = (module._OneAtATime(tmp_path / "file" / "none", tmp_path / "code") for _ in range(2))
+    order, entered = [], threading.Event()
+
+    def second() -> None:
+        entered.set()
+        with other:
+            order.append("second")
+
+    thread = threading.Thread(target=second)
+    with one, one:
+        thread.start()
+        assert entered.wait(20)
+        thread.join(0.05)
+        order.append("first")
+    thread.join(20)
+    assert order == ["first", "second"]
+
+
+_MADE_ONCE = """
+import made
+print(made.twice(21), made.twice(1.5), sum(made.twice.stats.cache_misses.values()))
+"""
+
+
+@pytest.mark.slow
+def test_of_processes_that_need_the_same_code_one_compiles_it(tmp_path: Path) -> None:
+    lines = ["from sl_nerfstudio.parallel import compiled", "@compiled", "def twice(x): return 2 * x", ""]
+    (tmp_path / "made.py").write_text("\n".join(lines))
+    paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    command, environment = [sys.executable, "-c", _MADE_ONCE], {**os.environ, "PYTHONPATH": paths}
+    started = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(3)]
+    said = [process.communicate(timeout=300)[0].split() for process in started]
+    assert [words[:2] for words in said] == [["42", "3.0"]] * 3
+    assert sum(int(words[2]) for words in said) == 2  # for whole numbers and for others

@@ -21,7 +21,7 @@ import torch
 from jaxtyping import Float64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
-from scipy.stats import t as student_t
+from scipy.special import stdtrit
 
 from sl_nerfstudio.calibration.board_adjustment import (
     AdjustedBoard,
@@ -152,7 +152,7 @@ def _simplest(scores: Sequence[ModelScore]) -> int:
         n = len(ratio)
         if one.costs.mean() > _MUCH_WORSE * best.costs.mean().clip(_LEAST_COST):
             return False
-        return bool(ratio.mean() <= student_t.ppf(_CERTAIN, n - 1) * ratio.std(ddof=1) / np.sqrt(n))
+        return bool(ratio.mean() <= stdtrit(n - 1, _CERTAIN) * ratio.std(ddof=1) / np.sqrt(n))
 
     return min((k for k, one in enumerate(scores) if as_good(one)), key=lambda k: scores[k].model.columns().shape[1])
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +12,14 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from sl_nerfstudio.calibration.board_adjustment import BoardView, Corners
-from sl_nerfstudio.decoding.decoder import Decoded, Decoder, DecodingError
+from sl_nerfstudio.decoding.decoder import Decoder, DecodingError
 from sl_nerfstudio.decoding.grid import NetworkDecoder
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_weight
 from sl_nerfstudio.pattern.boards import Board, CharucoBoard, Chessboard
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import ShownImage
 from sl_nerfstudio.scan.document import FileError
-from sl_nerfstudio.scan.images import as_grey, read_photograph
+from sl_nerfstudio.scan.images import Pixels, as_grey, read_photograph, shrunk
 
 LEAST_IN_PATTERN = 8  # corners of a view that the pattern must reach
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
@@ -99,24 +98,27 @@ class _Unused(Exception):
 def _read_pose(
     pose: BoardPhotographs, board: Board, decoder: Decoder[Any] | None
 ) -> tuple[Float32[ndarray, "h w"], Corners, BoardView, tuple[str, ...]]:
-    decode: Callable[[], Decoded] | None
-    if isinstance(decoder, NetworkDecoder):
-        pattern, grey = _pattern_and_plain(pose)
-        decode = partial(decoder.decode_image, without_reflectance(pattern, grey))
-    else:
-        grey = _even_light(pose, decoder)
-        decode = None if decoder is None else partial(decoder.decode, pose.images)
+    pattern, grey = (
+        _pattern_and_plain(pose) if isinstance(decoder, NetworkDecoder) else (None, _even_light(pose, decoder))
+    )
     corners = find_corners(grey, board)
     if corners is None:
         raise _Unused(_not_found(pose, grey, board), grey)
-    if decode is None:
+    if decoder is None:
         return grey, corners, BoardView(pose.name, corners, None), ()
-    folder = pose.images[0].parent
+    folder, factor = pose.images[0].parent, 1
+    images: list[Pixels] = []
+    if pattern is None:
+        images += [read_photograph(path) for path in pose.images]
+    else:
+        white = without_reflectance(pattern, grey)
+        factor = decoder.shrink_factor(white) or 1
+        images.append(shrunk(white, factor))
     try:
-        decoded = decode()
+        decoded = decoder.decode(images, [path.name for path in pose.images])
     except DecodingError as error:
         raise _Unused(FileError(folder, error.problem, error.cause, error.remedy), grey, corners) from error
-    carried = corners_in_pattern(corners, decoded.coords)
+    carried = corners_in_pattern(Corners(corners.ids, corners.uv / factor), decoded.coords)
     if len(carried.ids) < LEAST_IN_PATTERN:
         fault = FileError(
             folder,

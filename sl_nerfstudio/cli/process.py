@@ -22,7 +22,7 @@ _INPUTS = {
 }
 _GROUPS = {
     "devices": ("intrinsics", "projector_intrinsics", "projector_model", "procam_step", "rig", "estimate_projector"),
-    "captures": ("decoder", "sequence", "cell", "unordered", "not_mosaic"),
+    "captures": ("decoder", "sequence", "cell", "unordered", "not_mosaic", "full_size"),
     "lengths and poses": ("known_length", "poses", "no_adjust"),
     "what is used of the pictures": ("masks", "object_only", "color"),
     "this run": ("work", "jobs", "seed"),

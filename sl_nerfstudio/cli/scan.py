@@ -46,13 +46,15 @@ class ScanConfig:
     """how the devices moved: each by itself, both fixed to each other, or only the camera"""
     known_length: str | None = None
     """one true length: "baseline of frame 0 = 85 mm", or "distance between frame 3 (410.5, 200) and frame 7 (35, 80) =
-    50 mm" with pixels x, y; without it, the unit is arbitrary"""
+    50 mm" with pixels x, y of the photographs; without it, the unit is arbitrary"""
     object_only: bool = False
     """leave out the plane that the object stands on, walls, and what is not connected to the object"""
     masks: Path | None = None
     """folder with one mask for each frame, named like the frame: white is used, black is not"""
     color: Path | None = None
     """folder with photographs without the pattern, each from the same place as the frame that it is named like"""
+    full_size: bool = False
+    """decode every pixel of the photographs; otherwise large ones are shrunk as they are read"""
     quality: Literal["draft", "normal", "fine"] = "normal"
     """draft: a fifth of the training and coarse cells; fine: three times the training and finer cells"""
 
@@ -83,6 +85,7 @@ class ScanConfig:
         if self.is_scan:
             names = ("pattern", "intrinsics", "known_length", "masks", "color")
             given = [flag_name(name) for name in names if getattr(self, name) is not None]
+            given += ["--full-size"] if self.full_size else []
             if given:
                 raise UserError(
                     f"{', '.join(given)}: {self.photographs} is a scan folder, which states all of that itself\n"
@@ -109,6 +112,7 @@ class ScanConfig:
         return ProcessConfig(
             self.photographs, self.pattern, self.intrinsics, self.output / "scan", known_length=self.known_length,
             rig=self.rig, masks=self.masks, object_only=self.object_only, color=self.color,
+            full_size=self.full_size,
         )  # fmt: skip
 
 
@@ -120,7 +124,7 @@ _INPUTS = {
     "color": "give the folder with the photographs without the pattern",
 }
 _GROUPS = {
-    "photographs": ("pattern", "intrinsics", "known_length", "masks", "color"),
+    "photographs": ("pattern", "intrinsics", "known_length", "masks", "color", "full_size"),
     "the scan": ("rig", "object_only", "quality"),
 }
 _STEPS = {"draft": 200, "normal": 1000, "fine": 3000}  # of the training

@@ -15,6 +15,7 @@ from scipy.ndimage import find_objects
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.layout import PatternLayout
+from sl_nerfstudio.scan.images import Pixels
 
 # The result of every decoder, and the error of a capture that cannot be decoded.
 
@@ -158,11 +159,18 @@ class Decoder(ABC, Generic[L]):
         self.layout, self.order_stated = layout, order_stated
 
     @abstractmethod
-    def decode(self, paths: Sequence[Path]) -> Decoded:
-        """Read and decode the images of one frame.
+    def decode(self, images: Sequence[Pixels], names: Sequence[str]) -> Decoded:
+        """Decode the images of one frame, in the order of projection; `names` are those of their files, for messages.
 
-        Raises FileError for an image that cannot be read, and DecodingError for a capture that cannot be decoded.
+        Raises DecodingError for a capture that cannot be decoded.
         """
+
+    def shrink_factor(self, image: Pixels) -> int | None:
+        """By how much a photograph can be shrunk before it is decoded; None where it does not show the pattern.
+
+        1, as here: every pixel is needed.
+        """
+        return 1
 
     @property
     def key(self) -> str:

@@ -12,7 +12,7 @@ from sl_nerfstudio.decoding.grid import NetworkDecoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import PatternLayout
-from sl_nerfstudio.scan.images import read_photograph
+from sl_nerfstudio.scan.images import Pixels
 
 # The decoder of Gray-code sequences.
 
@@ -25,15 +25,14 @@ class GrayCodeDecoder(Decoder[GrayCode]):
     reads: ClassVar[str] = GrayCode.kind
     sequence: ClassVar[bool] = True
 
-    def decode(self, paths: Sequence[Path]) -> Decoded:
+    def decode(self, images: Sequence[Pixels], names: Sequence[str]) -> Decoded:
         """Decode the images of one sequence, in the order of projection."""
-        check_count(len(paths), self.layout)  # before reading them all
-        images = [read_photograph(path) for path in paths]
+        check_count(len(images), self.layout)
         check_sizes(images)
         samples = take_samples(images)
         check = check_order(samples, self.layout)
         other = None if check.fits else other_order(samples, self.layout)
-        fault = order_fault(check, self.layout, [path.name for path in paths], other)
+        fault = order_fault(check, self.layout, names, other)
         if fault is None:
             return decode_gray_code(images, self.layout)
         if not self.order_stated or not check.misplaced or other is not None:

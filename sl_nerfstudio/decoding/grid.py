@@ -18,6 +18,8 @@ from sl_nerfstudio.decoding.grid_graph import symbol_log_ratio
 from sl_nerfstudio.decoding.grid_phases import (
     LEAST_MASK,
     map_from_pixels,
+    measure_appearance,
+    node_places,
     sample_pixels,
     spread,
     to_pattern,
@@ -25,7 +27,7 @@ from sl_nerfstudio.decoding.grid_phases import (
 )
 from sl_nerfstudio.pattern.codes import rotate_codes
 from sl_nerfstudio.pattern.grid import GridPattern, normalise_locally, projected_light
-from sl_nerfstudio.scan.images import as_grey, read_photograph
+from sl_nerfstudio.scan.images import Pixels, as_grey, shrunk
 
 # An image of the coded grid, decoded without calibration or other frames.
 #
@@ -42,6 +44,10 @@ _TEAR = 0.5  # periods between neighbouring pixels
 _NORMALISING = 0.8  # window of the local intensity normalisation, periods
 _LIGHT_WINDOW = 0.5  # window in which the light is measured, periods
 _LIGHT_BLURS = (0.05, 0.09, 0.14, 0.2)  # of the pattern with which it is measured, periods
+# At which size a photograph is decoded.
+_FINEST = 12.0  # pixels a period that are enough: more give no better coordinates
+_LARGE = 1.5e6  # pixels; smaller photographs are decoded as they are
+_LOOKED_AT = 1200  # pixels of the longer side at which the grid is looked for first
 
 
 class GridImageDecoder:
@@ -82,6 +88,23 @@ class GridImageDecoder:
         if found is None or found.known < LEAST_NODES:
             raise refusal(grey, found, self._detector, self.pattern)
         return found
+
+    def shrink_factor(self, image: Pixels) -> int | None:
+        """By how much a photograph can be shrunk and still have `_FINEST` pixels a period; None where no grid is found.
+
+        The grid is looked for in a small copy, and in larger ones as long as its lines may be too fine for that.
+        """
+        if image.shape[0] * image.shape[1] < _LARGE:
+            return 1
+        factor = max(image.shape[:2]) // _LOOKED_AT
+        while factor >= 1:
+            found = self._detector.detect(as_grey(shrunk(image, factor)))
+            if found is not None and found.known >= LEAST_NODES:
+                nodes = node_places(found.maps, found.graph, found.assignment.known)
+                measured = measure_appearance(found.maps, found.appearance, nodes) or found.appearance
+                return max(1, int(factor * measured.period / _FINEST))
+            factor //= 2
+        return None
 
     def examine(self, grey: Float32[ndarray, "h w"], found: DetectedGrid) -> EdgeEvidence:
         """Coordinates of all pixels that a node reaches, and what tells the right ones from the wrong ones."""
@@ -142,17 +165,17 @@ class NetworkDecoder(Decoder[GridPattern]):
     """Decodes single images with the trained networks of this package."""
 
     name: ClassVar[str] = "network"
-    version: ClassVar[int] = 9
+    version: ClassVar[int] = 10
     reads: ClassVar[str] = GridPattern.kind
     sequence: ClassVar[bool] = False
 
-    def decode(self, paths: Sequence[Path]) -> Decoded:
+    def decode(self, images: Sequence[Pixels], names: Sequence[str]) -> Decoded:
         """Decode the one image of a frame."""
-        return self.decode_image(read_photograph(paths[0]))
+        return self.images.decode(images[0])
 
-    def decode_image(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
-        """Decode an image that was read or computed; otherwise like `decode`."""
-        return self.images.decode(image)
+    def shrink_factor(self, image: Pixels) -> int | None:
+        """The factor that leaves enough pixels a period."""
+        return self.images.shrink_factor(image)
 
     def weights(self) -> Iterable[Path]:
         """The files of the trained networks."""

@@ -17,7 +17,7 @@ from numpy import ndarray
 from sl_nerfstudio.decoding.decoder import large_regions
 from sl_nerfstudio.parallel import compiled
 
-# Gaussian means, local planes and changes of resolution for images with unknown parts.
+# Gaussian means and local planes for images with unknown parts.
 
 _REACH = 2.5  # of a Gaussian window, standard deviations
 
@@ -36,14 +36,18 @@ def gaussian_means(layers: Float32[ndarray, "k h w 4"], sigma: float) -> Float32
 
 
 def local_planes(
-    coords: Float32[ndarray, "h w 2"], inside: Bool[ndarray, "h w"], sigma: float
+    coords: Float32[ndarray, "h w 2"], weights: Float32[ndarray, "h w"], sigma: float
 ) -> Float32[ndarray, "h w 2"]:
-    """The value at each pixel of the plane that fits the values around it, in a Gaussian window, best."""
+    """The value at each pixel of the plane that fits the values around it, in a Gaussian window, best.
+
+    Values of weight zero may be NaN.
+    """
+    inside = weights > 0
     if not inside.any():
         return np.full_like(coords, np.nan)
     centre = np.nanmean(coords[inside], axis=0)
     products = np.zeros((3, *inside.shape, 4), dtype=np.float32)
-    _multiply(coords, inside, centre, np.float32(sigma), products)
+    _multiply(coords, weights, centre, np.float32(sigma), products)
     out = np.empty_like(coords)
     _evaluate_planes(gaussian_means(products, sigma), centre, np.float32(sigma), out)
     return out
@@ -52,6 +56,7 @@ def local_planes(
 def flattened(
     values: Float32[ndarray, "h w 2"],
     inside: Bool[ndarray, "h w"],
+    weights: Float32[ndarray, "h w"],
     windows: Sequence[tuple[float, float]],
     is_near: Callable[[Float32[ndarray, "h w 2"], float], Bool[ndarray, "h w"]],
 ) -> Float32[ndarray, "h w 2"]:
@@ -60,28 +65,30 @@ def flattened(
     `windows` are standard deviations, in pixels and largest first, each with the limit that `is_near` gets beside the
     plane's distance from the value. In narrow parts, and beside edges that were read without a tear, a window holds
     more than one surface: its plane is of none of them. Outside `inside`, values continue the nearest planes.
+    `weights` are those of the pixels in a plane, zero outside.
     """
     out = values
     for sigma, limit in reversed(windows):
-        plane = local_planes(values, inside, sigma)
+        plane = local_planes(values, weights, sigma)
         near = ~inside | is_near(plane - values, limit)
         out = np.where(near[..., None], plane, out)
     return out
 
 
 @compiled
-def _multiply(coords: ndarray, inside: ndarray, centre: ndarray, sigma: float, out: ndarray) -> None:
-    """Products of one, place and coordinates at the pixels inside: (1, x, y, xx), (xy, yy, u, ux), (uy, v, vx, vy)."""
-    h, w = inside.shape
+def _multiply(coords: ndarray, weights: ndarray, centre: ndarray, sigma: float, out: ndarray) -> None:
+    """Weighted products of one, place and coordinates: (1, x, y, xx), (xy, yy, u, ux), (uy, v, vx, vy)."""
+    h, w = weights.shape
     for row in range(h):
         y = (row - h / 2) / sigma
         for column in range(w):
-            if inside[row, column]:
+            n = weights[row, column]
+            if n > 0:
                 x = (column - w / 2) / sigma
-                u, v = coords[row, column, 0] - centre[0], coords[row, column, 1] - centre[1]
+                u, v = n * (coords[row, column, 0] - centre[0]), n * (coords[row, column, 1] - centre[1])
                 a, b, c = out[0, row, column], out[1, row, column], out[2, row, column]
-                a[0], a[1], a[2], a[3] = 1, x, y, x * x
-                b[0], b[1], b[2], b[3] = x * y, y * y, u, u * x
+                a[0], a[1], a[2], a[3] = n, n * x, n * y, n * x * x
+                b[0], b[1], b[2], b[3] = n * x * y, n * y * y, u, u * x
                 c[0], c[1], c[2], c[3] = u * y, v, v * x, v * y
 
 
@@ -106,14 +113,6 @@ def _evaluate_planes(means: ndarray, centre: ndarray, sigma: float, out: ndarray
                 cx, cy = vx - mean * mx, vy - mean * my
                 slope_x, slope_y = (syy * cx - sxy * cy) / determinant, (sxx * cy - sxy * cx) / determinant
                 out[row, column, axis] = centre[axis] + mean + slope_x * (x - mx) + slope_y * (y - my)
-
-
-def shrink(stack: Float32[ndarray, "h w k"], size: tuple[int, int], step: int) -> Float32[ndarray, "a b k"]:
-    """Means over squares of `step` pixels; the image continues with zeros where the last squares need it."""
-    h, w = stack.shape[:2]
-    full = cv2.copyMakeBorder(np.ascontiguousarray(stack), 0, size[1] * step - h, 0, size[0] * step - w,
-                              cv2.BORDER_CONSTANT)  # fmt: skip
-    return np.atleast_3d(cv2.resize(full, size, interpolation=cv2.INTER_AREA))
 
 
 def enlarge(stack: Float32[ndarray, "a b k"], shape: tuple[int, ...], step: int) -> Float32[ndarray, "h w k"]:
@@ -323,9 +322,6 @@ def _solve(means: ndarray, pixels: float, out: ndarray) -> None:
 # Regions.
 _TEAR = 0.35  # periods between neighbouring pixels
 _LEAST_AREA = 1.0  # smaller regions are left out, periods squared
-# Resolution.
-_FINEST = 12.0  # pixels per period: finer captures are averaged first
-_LEAST_INSIDE = 0.3  # share of the averaged pixels that must be in the region
 # Iteration.
 _WINDOW = 0.42  # of a shift, periods
 _ROUNDS = 6  # each recovers a part of the detail that the window of the fit averages over
@@ -348,43 +344,11 @@ def fit_densely(
     """
     out = np.full_like(coords, np.nan)
     agreement = np.zeros(image.shape, dtype=np.float32)
-    factor = max(1, int(pixels_a_period / _FINEST))
     least = _LEAST_AREA * pixels_a_period**2
     for box, inside in large_regions(coords, _TEAR * grids[0].period, least):
-        coarse = _coarser(image[box], coords[box], trust[box] * inside, inside, factor)
-        values, fit = _refine(*coarse, grids, pixels_a_period / factor)
-        values, fit = _finer(values, inside.shape, factor), _finer(fit, inside.shape, factor)
+        values, fit = _refine(image[box], coords[box], trust[box] * inside, inside, grids, pixels_a_period)
         out[box][inside], agreement[box][inside] = values[inside], fit[inside]
     return out, agreement
-
-
-def _coarser(
-    image: Float32[ndarray, "h w"],
-    coords: Float32[ndarray, "h w 2"],
-    trust: Float32[ndarray, "h w"],
-    inside: Bool[ndarray, "h w"],
-    factor: int,
-) -> tuple[Float32[ndarray, "a b"], Float32[ndarray, "a b 2"], Float32[ndarray, "a b"], Bool[ndarray, "a b"]]:
-    """Means over squares of `factor` pixels: faster for fine captures, and as accurate."""
-    if factor == 1:
-        return image, coords, trust, inside
-    h, w = inside.shape
-    size = (-(-w // factor), -(-h // factor))
-    weight = inside.astype(np.float32)
-    values = np.where(inside[..., None], coords, 0)
-    mean = shrink(np.dstack([weight, image * weight, values, trust]).astype(np.float32), size, factor)
-    known = np.maximum(mean[..., :1], 1e-6)
-    mean[..., 1:] /= known
-    covered = mean[..., 0] > _LEAST_INSIDE
-    return mean[..., 1].copy(), mean[..., 2:4].copy(), mean[..., 4] * covered, covered
-
-
-def _finer(values: Float32[ndarray, "a b *c"], shape: tuple[int, ...], factor: int) -> Float32[ndarray, "h w *c"]:
-    """Bilinear values at the pixels that `_coarser` averaged."""
-    if factor == 1:
-        return values
-    size = values.shape[1] * factor, values.shape[0] * factor
-    return cv2.resize(values, size, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
 
 
 def _refine(
@@ -427,4 +391,4 @@ def _smooth(
         return apart[..., 0] ** 2 + apart[..., 1] ** 2 < (limit * period) ** 2
 
     windows = [(window * pixels_a_period, limit) for window, limit in _SMOOTHING]
-    return flattened(coords, inside, windows, is_near)
+    return flattened(coords, inside, inside.astype(np.float32), windows, is_near)

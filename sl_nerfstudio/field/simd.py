@@ -19,7 +19,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic as _intrinsic
 
 from sl_nerfstudio.field.hash_grid import FEATURES
-from sl_nerfstudio.parallel import ANY_ORDER
+from sl_nerfstudio.parallel import ANY_ORDER, shared
 
 intrinsic: Any = _intrinsic  # callers omit the typing context, which type checkers cannot know
 F32, I32, I64 = ir.FloatType(), ir.IntType(32), ir.IntType(64)
@@ -49,7 +49,7 @@ def kernel(function: Callable[..., Any]) -> Any:
         return dispatcher
     # Kernels use one another's code and constants, but numba looks only at the file that a kernel is in.
     dispatcher._cache._cache_file._source_stamp = _sources()
-    return dispatcher
+    return shared(dispatcher)
 
 
 def needs_compiling(kernel: Any) -> bool:

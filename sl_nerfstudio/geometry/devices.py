@@ -50,6 +50,10 @@ class Device:
             **{k: getattr(self, k) * factor for k in ("fl_x", "fl_y", "cx", "cy")},
         )
 
+    def shrunk(self, factor: int) -> "Device":
+        """The device of an image whose squares of `factor` pixels are one, without what fills no square."""
+        return replace(self.scaled(1 / factor), w=self.w // factor, h=self.h // factor)
+
 
 DEVICE_FIELDS = tuple(f.name for f in fields(Device))
 

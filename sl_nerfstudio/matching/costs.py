@@ -1,35 +1,25 @@
-"""Matching costs of image and pattern at every pixel for every inverse distance, and the distances that cost least.
+"""Matching costs of image and pattern: correlations in Gaussian windows, at every inverse distance that is tried.
 
-Costs are correlations in Gaussian windows. Semi-global matching (Hirschmueller, "Stereo processing by semiglobal
-matching and mutual information", PAMI 2008) adds them up along eight ways to each pixel; changes of distance cost a
-little to the next one and more to any other. Changes are counted from the slope of the surface that was decoded, where
-one was: otherwise steep surfaces would cost more than those that face the camera (Scharstein, Taniai and Sinha,
-"Semi-global stereo matching with surface orientation priors", 3DV 2017).
+Tiles that lie side by side and have about the same range are computed together, as a block with half a window around
+it, one inverse distance after the other: all that is needed on the way stays in the processor's nearest memory.
 """
-
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32, UInt8
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.grid_fit import DrawnGrid
-from sl_nerfstudio.matching.lines import EpipolarLines
+from sl_nerfstudio.matching.lines import EpipolarLines, places_on_lines
+from sl_nerfstudio.matching.ranges import TILE, TriedRanges
 from sl_nerfstudio.parallel import compiled
 
 LEAST_PATTERN_VARIANCE = 1e-3  # added to that of the drawn pattern: where it is flat, nothing can be compared
 LEAST_IMAGE_VARIANCE = 0.03  # added to that of the image, as a share of its median at decoded pixels
-SMALL, LARGE = 30, 250  # costs of a change to the next inverse distance, and to any other
-STEEPEST = 4  # steps from one pixel to the next up to which a decoded surface is steep; beyond, it has a jump there
-APART = 3  # steps from the best inverse distance within which another one is no rival
 
 HALF = 127  # the cost where image and pattern have nothing to do with each other
 OUTSIDE = 255  # the cost beside the pattern
-_TOGETHER = 16  # inverse distances whose costs are written at once
-_BAND = 48  # rows whose costs are computed at once: all that is needed on the way stays in the processor's memory
-_NEVER = np.int16(16000)  # more than any way costs
+_WIDEST = 6  # tiles of a block
 
 Statistics = tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]
 """Mean of the image in the window of each pixel, and its variance, with what is added to it."""
@@ -48,35 +38,29 @@ def matching_costs(
     statistics: Statistics,
     lines: EpipolarLines,
     inverse_distances: Float64[ndarray, "k"],
+    tried: TriedRanges,
     grid: DrawnGrid,
     sigma: float,
-) -> UInt8[ndarray, "h w k"]:
-    """Costs from 0 (correlation 1) over 127 (correlation 0) to 254 (correlation -1); 255 beside the pattern."""
+) -> UInt8[ndarray, "cells"]:
+    """Costs of what is tried: from 0 (correlation 1) over 127 (correlation 0) to 254 (-1); 255 beside the pattern."""
     mean, variance = statistics
-    scale = 1 / np.sqrt(variance)
-    picture, weights = np.ascontiguousarray(grid.layers[..., 0]), _half_window(sigma)
-    least, h = np.float32(LEAST_PATTERN_VARIANCE), len(image)
-    out = np.empty((*image.shape, len(inverse_distances)), dtype=np.uint8)
-    for first in range(0, h, _BAND):
-        inner, around = _with_window(first, h, len(weights) - 1)
-        band, there = lines.part((around, slice(None))), (image[around], mean[around], scale[around])
-        x, y, drawn = (np.empty(image[around].shape, dtype=np.float32) for _ in range(3))
-        block = np.empty((_TOGETHER, *x.shape), dtype=np.uint8)
-        for start in range(0, len(inverse_distances), _TOGETHER):
-            some = inverse_distances[start : start + _TOGETHER]
-            for w, costs in zip(some, block, strict=False):
-                band.pixels_at(w, x, y)
-                sample(picture, x, y, drawn)
-                fill_costs(drawn, *there, weights, least, costs)
-                mark_outside(x, y, picture.shape, costs)
-            interleave(block[: len(some), inner], start, out[first : first + _BAND])
+    h, w = grid.layers.shape[:2]
+    out = np.full(tried.cells, OUTSIDE, dtype=np.uint8)
+    _fill_costs(
+        lines.for_tiles, inverse_distances, _neighbours(grid.layers[..., 0]), (w, h),
+        (image, mean, 1 / np.sqrt(variance)), _half_window(sigma), np.float32(LEAST_PATTERN_VARIANCE),
+        tried.first, tried.count, tried.start, out,
+    )  # fmt: skip
     return out
 
 
-def _with_window(first: int, h: int, reach: int) -> tuple[slice, slice]:
-    """Rows of a band within those that its windows need, and the latter."""
-    begin, end = max(first - reach, 0), min(first + _BAND + reach, h)
-    return slice(first - begin, min(first + _BAND, h) - begin), slice(begin, end)
+def _neighbours(picture: Float32[ndarray, "h w"]) -> UInt32[ndarray, "h*w"]:
+    """Each pixel of a picture between 0 and 1, and those to the right and below, as bytes: one access gets all four."""
+    values = np.rint(255 * picture).astype(np.uint32)
+    out = values.copy()
+    out[:, :-1] |= values[:, 1:] << np.uint32(8)
+    out[:-1] |= out[1:] << np.uint32(16)
+    return out.ravel()
 
 
 def correlations(
@@ -111,246 +95,152 @@ def _reach(sigma: float) -> int:
 
 
 @compiled
-def sample(picture: ndarray, x: ndarray, y: ndarray, out: ndarray) -> None:
-    """The picture at columns x and rows y, bilinear; beside it as at its border."""
-    pixels, width, zero = picture.ravel(), picture.shape[1], np.float32(0)
-    right, lower = picture.shape[1] - 1, picture.shape[0] - 1
-    for row in range(out.shape[0]):
-        for column in range(out.shape[1]):
-            u = min(max(zero, x[row, column]), np.float32(right))
-            v = min(max(zero, y[row, column]), np.float32(lower))
-            i, j = min(np.int32(u), right - 1), min(np.int32(v), lower - 1)
-            place, a, b = j * width + i, u - np.float32(i), v - np.float32(j)
-            above = pixels[place] + a * (pixels[place + 1] - pixels[place])
-            place += width
-            below = pixels[place] + a * (pixels[place + 1] - pixels[place])
-            out[row, column] = above + b * (below - above)
-
-
-@compiled
-def fill_costs(
-    drawn: ndarray, image: ndarray, mean: ndarray, scale: ndarray, weights: ndarray, least: float, out: ndarray
+def _fill_costs(
+    lines: tuple[int, ndarray, ndarray, ndarray],
+    inverse_distances: ndarray,
+    words: ndarray,
+    size: tuple[int, int],
+    values: tuple[ndarray, ndarray, ndarray],
+    weights: ndarray,
+    least: float,
+    first: ndarray,
+    count: ndarray,
+    start: ndarray,
+    out: ndarray,
 ) -> None:
-    """Costs of a picture that was drawn for an image with known mean and inverse standard deviation in each window.
-
-    Row by row, so that all that is needed on the way stays in the processor's nearest memory.
-    """
-    h, w = image.shape
-    sums, longer = np.empty((3, w), dtype=np.float32), np.empty(w + 2 * (len(weights) - 1), dtype=np.float32)
-    for row in range(h):
-        _sum_down(drawn, image, row, weights, sums)
-        for n in range(3):
-            _sum_along(sums[n], weights, longer)
-        _write_costs(sums[0], sums[1], sums[2], mean[row], scale[row], least, out[row])
-
-
-@compiled
-def _sum_down(drawn: ndarray, image: ndarray, row: int, weights: ndarray, out: ndarray) -> None:
-    """Sums over the window's rows: of the pattern, of its square, and of its product with the image."""
+    """Fill the costs, block by block. `values`: image, mean and inverse deviation in the window of each pixel."""
+    code, parameters, centre, planes = lines
+    image, mean, scale = values
     h, w = image.shape
     reach = len(weights) - 1
-    out[:] = 0
-    p, pp, ip = out[0], out[1], out[2]
-    for k in range(-reach, reach + 1):
-        there = row + k
-        there = -1 - there if there < 0 else 2 * h - 1 - there if there >= h else there  # reflected at the border
-        weight, a, b = weights[abs(k)], drawn[min(max(there, 0), h - 1)], image[min(max(there, 0), h - 1)]
-        for column in range(w):
-            p[column] += weight * a[column]
-            pp[column] += weight * a[column] * a[column]
-        for column in range(w):
-            ip[column] += weight * a[column] * b[column]
+    most = (TILE + 2 * reach) * (_WIDEST * TILE + 2 * reach)
+    ray, grey, room = np.empty((5, most), np.float32), np.empty((3, most), np.float32), np.empty((8, most), np.float32)
+    read, inside, costs = np.empty(most, np.uint32), np.empty(most, np.bool_), np.empty(most, np.uint8)
+    for a in range(first.shape[0]):
+        b = 0
+        while b < first.shape[1]:
+            end, low, high = _block(first[a], count[a], b, 2 * reach)
+            rows, width = min(TILE, h - a * TILE), min(end * TILE, w) - b * TILE + 2 * reach
+            whole, middle, inner = (rows + 2 * reach) * width, rows * width, rows * width - 2 * reach
+            corner, begin = (a * TILE - reach, b * TILE - reach), reach * width + reach
+            if high > low:
+                for n in range(5):
+                    _cut_out(planes[n], corner, width, ray[n, :whole])
+                _cut_out(image, corner, width, grey[0, :whole])
+                _cut_out(mean, corner, width, grey[1, :whole])
+                _cut_out(scale, corner, width, grey[2, :whole])
+            x, y = room[0, :whole], room[1, :whole]
+            drawn, square, product = room[2, :whole], room[3, :whole], room[4, :whole]
+            for k in range(low, high):
+                places_on_lines(code, parameters, ray, centre, inverse_distances[k], x, y)
+                _draw(words, size, x, y, read, inside, drawn)
+                _multiply(drawn, grey[0], square, product)
+                for n in range(3):
+                    _blur(room[2 + n], weights, width, room[5 + n, :middle])
+                    _blur(room[5 + n], weights, 1, room[n, :inner])
+                _write(
+                    room[0], room[1], room[2], grey[1, begin:], grey[2, begin:], inside[begin:], least, costs[:inner]
+                )
+                for tile in range(b, end):
+                    n, place = count[a, tile], k - first[a, tile]
+                    if 0 <= place < n:
+                        columns = min(TILE, w - tile * TILE)
+                        _spread(costs[(tile - b) * TILE :], width, rows, columns, n, out[start[a, tile] + place :])
+            b = end
 
 
 @compiled
-def _sum_along(row: ndarray, weights: ndarray, longer: ndarray) -> None:
-    """Sums over the window's columns, in place. `longer` is room for the row, reflected at both ends."""
-    w, reach = len(row), len(weights) - 1
-    longer[reach : reach + w] = row
-    for k in range(reach):
-        longer[reach - 1 - k], longer[reach + w + k] = row[min(k, w - 1)], row[w - 1 - min(k, w - 1)]
-    for column in range(w):
-        row[column] *= weights[0]
+def _block(first: ndarray, count: ndarray, begin: int, border: int) -> tuple[int, int, int]:
+    """The end of a block of tiles of a row, and of the range of all: as many as are together less than apart."""
+    end, low, high = begin + 1, first[begin], first[begin] + count[begin]
+    while end < min(begin + _WIDEST, len(first)) and count[begin] > 0 and count[end] > 0:
+        lower, higher = min(low, first[end]), max(high, first[end] + count[end])
+        wide = TILE * (end - begin) + border
+        if (higher - lower) * (wide + TILE) > (high - low) * wide + count[end] * (TILE + border):
+            break
+        end, low, high = end + 1, lower, higher
+    return end, low, high
+
+
+@compiled
+def _cut_out(values: ndarray, corner: tuple[int, int], width: int, out: ndarray) -> None:
+    """Rows of a part of the image, one after the other; beyond the image's border, it is reflected."""
+    h, w = values.shape
+    for row in range(len(out) // width):
+        i = _reflected(corner[0] + row, h)
+        for column in range(width):
+            out[row * width + column] = values[i, _reflected(corner[1] + column, w)]
+
+
+@compiled
+def _reflected(place: int, size: int) -> int:
+    place = -1 - place if place < 0 else 2 * size - 1 - place if place >= size else place
+    return min(max(place, 0), size - 1)
+
+
+@compiled
+def _draw(
+    words: ndarray, size: tuple[int, int], x: ndarray, y: ndarray, read: ndarray, inside: ndarray, out: ndarray
+) -> None:
+    """The picture at columns x and rows y, bilinear, and which of them are inside; beside it as at its border.
+
+    One loop gets the words, because the others can then work on several numbers at once.
+    """
+    width, zero, half = np.int32(size[0]), np.float32(0), np.float32(0.5)
+    right, lower = np.float32(size[0] - 1), np.float32(size[1] - 1)
+    last, lowest = np.int32(size[0] - 2), np.int32(size[1] - 2)
+    for n in range(len(out)):
+        u, v = min(max(zero, x[n]), right), min(max(zero, y[n]), lower)
+        i, j = min(np.int32(u), last), min(np.int32(v), lowest)
+        inside[n] = (x[n] >= -half) & (y[n] >= -half) & (x[n] <= right + half) & (y[n] <= lower + half)
+        read[n] = np.uint32(j * width + i)
+        x[n], y[n] = u - np.float32(i), v - np.float32(j)
+    for n in range(len(out)):
+        read[n] = words[read[n]]
+    byte, scale = np.int32(255), np.float32(1 / 255)
+    for n in range(len(out)):
+        word = np.int32(read[n])
+        a, b = np.float32(word & byte), np.float32((word >> 8) & byte)
+        c, d = np.float32((word >> 16) & byte), np.float32((word >> 24) & byte)
+        above, below = a + x[n] * (b - a), c + x[n] * (d - c)
+        out[n] = (above + y[n] * (below - above)) * scale
+
+
+@compiled
+def _multiply(drawn: ndarray, image: ndarray, square: ndarray, product: ndarray) -> None:
+    for n in range(len(drawn)):
+        square[n], product[n] = drawn[n] * drawn[n], drawn[n] * image[n]
+
+
+@compiled
+def _blur(values: ndarray, weights: ndarray, step: int, out: ndarray) -> None:
+    """Weighted sums of values and those some steps before and after; first of the first value that has them all."""
+    reach = len(weights) - 1
+    middle = values[reach * step :]
+    for n in range(len(out)):
+        out[n] = weights[0] * middle[n]
     for k in range(1, reach + 1):
-        weight, left, right = weights[k], longer[reach - k :], longer[reach + k :]
-        for column in range(w):
-            row[column] += weight * (left[column] + right[column])
+        weight, before, after = weights[k], values[(reach - k) * step :], values[(reach + k) * step :]
+        for n in range(len(out)):
+            out[n] += weight * (before[n] + after[n])
 
 
 @compiled
-def _write_costs(
-    p: ndarray, pp: ndarray, ip: ndarray, mean: ndarray, scale: ndarray, least: float, out: ndarray
+def _write(
+    p: ndarray, pp: ndarray, ip: ndarray, mean: ndarray, scale: ndarray, inside: ndarray, least: float, out: ndarray
 ) -> None:
     half, one = np.float32(HALF), np.float32(1)
-    for column in range(len(out)):
-        m = p[column]
-        spread = max(pp[column] - m * m, np.float32(0)) + least
-        correlation = (ip[column] - m * mean[column]) * scale[column] / np.sqrt(spread)
-        out[column] = np.uint8(min(max(half * (one - correlation), np.float32(0)), 2 * half))
+    for n in range(len(out)):
+        m = p[n]
+        spread = max(pp[n] - m * m, np.float32(0)) + least
+        correlation = (ip[n] - m * mean[n]) * scale[n] / np.sqrt(spread)
+        cost = np.uint8(min(max(half * (one - correlation), np.float32(0)), 2 * half))
+        out[n] = cost if inside[n] else np.uint8(OUTSIDE)
 
 
 @compiled
-def mark_outside(x: ndarray, y: ndarray, size: tuple[int, int], out: ndarray) -> None:
-    """The cost beside the picture, where columns x and rows y are."""
-    half, right, lower = np.float32(0.5), np.float32(size[1] - 0.5), np.float32(size[0] - 0.5)
-    for row in range(out.shape[0]):
-        for column in range(out.shape[1]):
-            u, v = x[row, column], y[row, column]
-            inside = (u >= -half) & (v >= -half) & (u <= right) & (v <= lower)
-            out[row, column] = out[row, column] if inside else np.uint8(OUTSIDE)
-
-
-@compiled
-def interleave(block: ndarray, first: int, out: ndarray) -> None:
-    """Several images of costs into the volume: one at a time, each pixel would be a place of its own in memory."""
-    for row in range(out.shape[0]):
-        for column in range(out.shape[1]):
-            for k in range(len(block)):
-                out[row, column, first + k] = block[k, row, column]
-
-
-# Semi-global matching.
-
-
-@dataclass(frozen=True)
-class StereoMatches:
-    """The best of the inverse distances that were tried, for every pixel."""
-
-    index: Float32[ndarray, "h w"]  # its number, with the fraction of a step that a parabola through the sums says
-    cost: UInt8[ndarray, "h w"]  # its own, without changes
-    margin: Float32[ndarray, "h w"]  # by how much the sums of the best rival are larger
-
-    def part(self, rows: slice) -> "StereoMatches":
-        """The matches of some rows."""
-        return StereoMatches(self.index[rows], self.cost[rows], self.margin[rows])
-
-    @staticmethod
-    def joined(parts: Sequence["StereoMatches"]) -> "StereoMatches":
-        """The matches of parts, one below the other."""
-        return StereoMatches(
-            *(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(StereoMatches))
-        )
-
-
-def match_semi_globally(costs: UInt8[ndarray, "h w k"], decoded: Int32[ndarray, "h w"]) -> StereoMatches:
-    """The best match of every pixel. There must be at least three inverse distances.
-
-    `decoded` are the numbers of those that were decoded, `UNKNOWN` where nothing was.
-    """
-    sums = np.zeros(costs.shape, dtype=np.uint16)
-    for step in (1, -1):
-        _add_ways(costs, decoded, step, SMALL, LARGE, STEEPEST, sums)
-    h, w = costs.shape[:2]
-    index, cost = np.empty((h, w), dtype=np.float32), np.empty((h, w), dtype=np.uint8)
-    margin = np.empty((h, w), dtype=np.float32)
-    _choose(costs, sums, APART, index, cost, margin)
-    return StereoMatches(index, cost, margin)
-
-
-@compiled
-def _add_ways(
-    costs: ndarray, decoded: ndarray, step: int, small: int, large: int, steepest: int, sums: ndarray
-) -> None:
-    """Add to `sums` what the least costly way to each pixel costs, less what all its ways share, for four directions.
-
-    With a step of 1, they come from the left and from the three pixels above; with -1 from the opposite ones.
-    """
-    h, w, count = costs.shape
-    beyond = steepest + 1  # places on both sides of a way for inverse distances that are not tried
-    shape = (3, w, count + 2 * beyond)
-    before, here = np.full(shape, _NEVER, dtype=np.int16), np.full(shape, _NEVER, dtype=np.int16)
-    least_before, least_here = np.zeros((3, w), dtype=np.int16), np.zeros((3, w), dtype=np.int16)
-    side, least_side = np.full((2, shape[2]), _NEVER, dtype=np.int16), np.int16(0)
-    away, near = np.int16(large), np.int16(small)
-    for i in range(h):
-        row = i if step > 0 else h - 1 - i
-        for j in range(w):
-            column = j if step > 0 else w - 1 - j
-            own, out = costs[row, column], side[j % 2]
-            if j == 0:
-                least_side = _begin(own, beyond, out)
-            else:
-                slope = _slope(decoded, row, column, row, column - step, steepest)
-                least_side = _go_on(own, side[(j + 1) % 2], least_side, beyond - slope, beyond, near, away, out)
-            for n in range(3):
-                last, out = column + n - 1, here[n, column]
-                if i == 0 or last < 0 or last >= w:
-                    least_here[n, column] = _begin(own, beyond, out)
-                else:
-                    slope = _slope(decoded, row, column, row - step, last, steepest)
-                    came, least = before[n, last], least_before[n, last]
-                    least_here[n, column] = _go_on(own, came, least, beyond - slope, beyond, near, away, out)
-            _add(side[j % 2], here[:, column], beyond, sums[row, column])
-        before, here, least_before, least_here = here, before, least_here, least_before
-
-
-@compiled
-def _slope(decoded: ndarray, row: int, column: int, row_before: int, column_before: int, steepest: int) -> int:
-    """Steps of the inverse distance from the pixel before to this one; 0 where there is a jump or nothing decoded."""
-    steps = decoded[row, column] - decoded[row_before, column_before]
-    return steps if abs(steps) <= steepest else 0
-
-
-@compiled
-def _begin(costs: ndarray, beyond: int, out: ndarray) -> np.int16:
-    """The first pixel of a way; returns the least of `out`."""
-    least = _NEVER
-    for k in range(len(costs)):
-        out[beyond + k] = costs[k]
-        least = min(least, np.int16(costs[k]))
-    return least
-
-
-@compiled
-def _go_on(
-    costs: ndarray,
-    came: ndarray,
-    least: np.int16,
-    first: int,
-    beyond: int,
-    near: np.int16,
-    away: np.int16,
-    out: ndarray,
-) -> np.int16:
-    """Go from one pixel to the next, in 16 bits throughout; returns the least of `out`.
-
-    The first inverse distance continues place `first` of the pixel before, the others the places after it.
-    """
-    count = len(costs)
-    below, same, above = came[first - 1 :], came[first:], came[first + 1 :]
-    ways, jump, smallest = out[beyond : beyond + count], np.int16(least + away), _NEVER
-    for k in range(count):
-        cheapest = min(min(np.int16(min(below[k], above[k]) + near), same[k]), jump)
-        way = np.int16(np.int16(cheapest - least) + np.int16(costs[k]))
-        ways[k] = way
-        smallest = min(smallest, way)
-    return smallest
-
-
-@compiled
-def _add(side: ndarray, others: ndarray, beyond: int, sums: ndarray) -> None:
-    count = len(sums)
-    a, b, c, d = side[beyond:], others[0, beyond:], others[1, beyond:], others[2, beyond:]
-    for k in range(count):
-        sums[k] += np.uint16(a[k] + b[k] + c[k] + d[k])
-
-
-@compiled
-def _choose(costs: ndarray, sums: ndarray, apart: int, index: ndarray, cost: ndarray, margin: ndarray) -> None:
-    h, w, count = sums.shape
-    for row in range(h):
-        for column in range(w):
-            total = sums[row, column]
-            best = 0
-            for k in range(1, count):
-                if total[k] < total[best]:
-                    best = k
-            rival = 65535
-            for k in range(count):
-                if abs(k - best) > apart and total[k] < rival:
-                    rival = total[k]
-            cost[row, column], margin[row, column] = costs[row, column, best], rival - np.int64(total[best])
-            middle = min(max(best, 1), count - 2)
-            a, b, c = np.int64(total[middle - 1]), np.int64(total[middle]), np.int64(total[middle + 1])
-            bend = a - 2 * b + c
-            index[row, column] = middle + (min(max((a - c) / (2 * bend), -1), 1) if bend > 0 else best - middle)
+def _spread(costs: ndarray, width: int, rows: int, columns: int, count: int, out: ndarray) -> None:
+    """The costs of one inverse distance, `count` places from pixel to pixel."""
+    for row in range(rows):
+        for column in range(columns):
+            out[(row * TILE + column) * count] = costs[row * width + column]

@@ -6,12 +6,10 @@ Lengths in an image are in periods of the pattern as it appears there.
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int32
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.grid_edges import slopes
 from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of, ray_of, view_of
 from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.grid import gaussian_window
@@ -20,6 +18,7 @@ TEAR = 0.35  # difference between neighbouring pixels that separates surfaces, p
 FEWEST_FOR_SIZE = 100  # pixels from which the size of a period is told
 OUTSIDE_PX = -1e6  # in place of coordinates where nothing is seen
 NEAREST_STEPS = 4  # of Gauss-Newton, to the nearest place on a line
+NEAREST_EXACT = 1e-6  # change of the inverse distance, as a share of it, that is too small for another step
 UNKNOWN = -(2**20)  # far from the number of any inverse distance
 
 # The inverse distances that are tried.
@@ -63,17 +62,6 @@ class EpipolarLines:
         _follow(*self.arrays, w, out)
         return out
 
-    def pixels_at(self, w: float, x: Float32[ndarray, "h w"], y: Float32[ndarray, "h w"]) -> None:
-        """Fill columns and rows in the pattern's image, the first pixel's centre being 0, at one inverse distance.
-
-        They are far outside where the projector does not see the point.
-        """
-        code, parameters, ray, centre, offset = self.arrays
-        if code == 0 and not parameters[4:].any():
-            _pinhole_pixels(parameters, self._planes, centre, w, x, y)
-        else:
-            _pixels(code, parameters, ray, centre, offset, w, x, y)
-
     def slopes(self, w: Float64[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
         """Derivative of the coordinates by the inverse distance."""
         out = np.empty(self.offset.shape, dtype=np.float32)
@@ -86,11 +74,11 @@ class EpipolarLines:
         _nearest(*self.arrays, coords, out)
         return out
 
-    @cached_property
-    def _planes(self) -> Float32[ndarray, "5 h w"]:
-        """Rays and offsets, one coordinate after the other."""
+    @property
+    def for_tiles(self) -> tuple[int, ndarray, ndarray, Float32[ndarray, "5 h w"]]:
+        """Arguments of `places_on_lines`: model code and parameters, centre, rays and offsets one after the other."""
         values = np.concatenate([self.ray, self.offset], axis=-1, dtype=np.float32)
-        return np.ascontiguousarray(np.moveaxis(values, -1, 0))
+        return *for_loops(self.projector), self.centre, np.ascontiguousarray(np.moveaxis(values, -1, 0))
 
     @cached_property
     def arrays(self) -> tuple[int, ndarray, ndarray, ndarray, ndarray]:
@@ -167,32 +155,6 @@ def pixels_a_period(coords: Float32[ndarray, "h w 2"], period: float) -> float |
     return period / float(np.sqrt(np.median(area))) if len(area) >= FEWEST_FOR_SIZE else None
 
 
-def enlarged(
-    coords: Float32[ndarray, "a b 2"], factor: int, shape: tuple[int, int], period: float
-) -> Float32[ndarray, "h w 2"]:
-    """Coordinates at the pixels of an image of the given shape; those given are at squares of `factor` of its pixels.
-
-    Bilinear within a surface; at its border, the square's plane is continued. NaN where a pixel's square has none.
-    """
-    if factor == 1:
-        return coords
-    h, w = shape
-    size = coords.shape[1] * factor, coords.shape[0] * factor
-    near = np.repeat(np.repeat(coords, factor, axis=0), factor, axis=1)
-    slope = np.repeat(np.repeat(slopes(coords, period), factor, axis=0), factor, axis=1)
-    place = ((np.arange(factor) + 0.5) / factor - 0.5).astype(np.float32)
-    x, y = np.tile(place, coords.shape[1])[None, :, None], np.tile(place, coords.shape[0])[:, None, None]
-    plane = near + slope[..., 0] * x + slope[..., 1] * y
-    linear = cv2.resize(coords, size, interpolation=cv2.INTER_LINEAR)  # NaN beside what is unknown
-    smooth = np.abs(linear - near).max(-1, keepdims=True) < TEAR * period
-    half = factor // 2  # beside the image's border, where interpolation has one side only
-    smooth[:half], smooth[-half:], smooth[:, :half], smooth[:, -half:] = False, False, False, False
-    whole = np.where(smooth, linear, np.where(np.isfinite(plane), plane, near))
-    out = np.full((h, w, 2), np.nan, dtype=np.float32)
-    out[: size[1], : size[0]] = np.where(np.isfinite(near), whole, np.float32(np.nan))
-    return out
-
-
 @compiled
 def _turned_rays(code: int, parameters: ndarray, R: ndarray, out: ndarray) -> None:
     for row in range(out.shape[0]):
@@ -222,32 +184,29 @@ def _follow(
 
 
 @compiled
-def _pixels(
-    code: int, parameters: ndarray, ray: ndarray, centre: ndarray, offset: ndarray, w: float, x: ndarray, y: ndarray
+def places_on_lines(
+    code: int, parameters: ndarray, planes: ndarray, centre: ndarray, w: float, x: ndarray, y: ndarray
 ) -> None:
-    for row in range(x.shape[0]):
-        for column in range(x.shape[1]):
-            u, v, front = pixel_of(code, *_point(ray[row, column], centre, w), parameters)
-            x[row, column] = u + offset[row, column, 0] - 0.5 if front else OUTSIDE_PX
-            y[row, column] = v + offset[row, column, 1] - 0.5 if front else OUTSIDE_PX
+    """Fill columns and rows in the pattern's image, the first pixel's centre being 0, at one inverse distance.
 
-
-@compiled
-def _pinhole_pixels(parameters: ndarray, planes: ndarray, centre: ndarray, w: float, x: ndarray, y: ndarray) -> None:
-    """Fill columns and rows for a pinhole without distortion, ten times as fast."""
+    They are far outside where the projector does not see the point. Without distortion, this is ten times as fast.
+    """
     f = np.float32
     fx, fy, cx, cy = f(parameters[0]), f(-parameters[1]), f(parameters[2] - 0.5), f(parameters[3] - 0.5)
     a, b, c = f(w * centre[0]), f(w * centre[1]), f(w * centre[2])
     outside, nearest = f(OUTSIDE_PX), f(-1e-12)
     ray_x, ray_y, ray_z, du, dv = planes[0], planes[1], planes[2], planes[3], planes[4]
-    for row in range(x.shape[0]):
-        for column in range(x.shape[1]):
-            z = ray_z[row, column] + c
+    if code == 0 and not parameters[4:].any():
+        for n in range(len(x)):
+            z = ray_z[n] + c
             q = f(-1) / min(z, nearest)
-            u = fx * (ray_x[row, column] + a) * q + cx + du[row, column]
-            v = fy * (ray_y[row, column] + b) * q + cy + dv[row, column]
-            x[row, column] = u if z < f(0) else outside
-            y[row, column] = v if z < f(0) else outside
+            u, v = fx * (ray_x[n] + a) * q + cx + du[n], fy * (ray_y[n] + b) * q + cy + dv[n]
+            x[n], y[n] = u if z < f(0) else outside, v if z < f(0) else outside
+        return
+    for n in range(len(x)):
+        u, v, front = pixel_of(code, ray_x[n] + a, ray_y[n] + b, ray_z[n] + c, parameters)
+        x[n] = u + du[n] - 0.5 if front else OUTSIDE_PX
+        y[n] = v + dv[n] - 0.5 if front else OUTSIDE_PX
 
 
 @compiled
@@ -289,6 +248,9 @@ def _nearest(
                     break
                 du = view[3] * centre[0] + view[4] * centre[1] + view[5] * centre[2]
                 dv = view[6] * centre[0] + view[7] * centre[1] + view[8] * centre[2]
-                s += (du * (u - view[0]) + dv * (v - view[1])) / max(du * du + dv * dv, 1e-300)
+                step = (du * (u - view[0]) + dv * (v - view[1])) / max(du * du + dv * dv, 1e-300)
+                s += step
+                if abs(step) < NEAREST_EXACT * abs(s):
+                    break
             if front and s > 0:
                 out[row, column] = s

@@ -4,7 +4,7 @@ Inverse distances are matched semi-globally; the matches are fitted to the image
 of each says how probable it is that it is right.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
@@ -21,32 +21,24 @@ from sl_nerfstudio.decoding.grid_fit import (
     fit_shift,
     flattened,
     measure_light,
-    shrink,
 )
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.matching.costs import (
-    Statistics,
-    StereoMatches,
-    correlations,
-    image_statistics,
-    match_semi_globally,
-    matching_costs,
-)
+from sl_nerfstudio.matching.costs import Statistics, correlations, image_statistics, matching_costs
 from sl_nerfstudio.matching.lines import (
     OUTSIDE_PX,
     TEAR,
     EpipolarLines,
-    enlarged,
     hypotheses,
     numbers_of,
     pixels_a_period,
     with_offset,
 )
+from sl_nerfstudio.matching.ranges import TILE, TriedRanges
+from sl_nerfstudio.matching.semi_global import StereoMatches, match_semi_globally
 from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.grid import GridPattern
 
 COST_WINDOW = 0.14  # standard deviation of the window of correlations, periods
-FINEST = 12.0  # pixels per period: finer captures are averaged first
 MOST_BYTES = 2**28  # memory for costs; larger images are matched in strips
 STRIP_MARGIN = 6.0  # by which strips overlap on each side, periods
 
@@ -87,15 +79,6 @@ class DecodedImage:
         """The pixels in a box."""
         return DecodedImage(*(np.ascontiguousarray(one[box]) for one in (self.grey, self.coords, self.mask)))
 
-    def shrunk(self, factor: int) -> "DecodedImage":
-        """Squares of `factor` pixels as one: means of the image, and what the pixel in their middle has."""
-        if factor == 1:
-            return self
-        h, w = self.mask.shape[0] // factor, self.mask.shape[1] // factor
-        grey = shrink(self.grey[: h * factor, : w * factor, None], (w, h), factor)[..., 0]
-        middle = (slice(factor // 2, h * factor, factor), slice(factor // 2, w * factor, factor))
-        return DecodedImage(grey, np.ascontiguousarray(self.coords[middle]), np.ascontiguousarray(self.mask[middle]))
-
 
 @dataclass(frozen=True)
 class MatchedImage:
@@ -122,18 +105,12 @@ class LineMatcher:
         size = pixels_a_period(image.coords, period)
         if size is None:
             return image.coords
-        factor = max(1, int(size / FINEST))
-        small = image.shrunk(factor)
-        h, w = small.mask.shape
-        lines = EpipolarLines.of(replace(camera.scaled(1 / factor), w=w, h=h), projector, T_camera_projector)
-        matched = self.matched(small, lines, size / factor)
-        if matched is None or not self._agrees(small, matched):
+        matched = self.matched(image, EpipolarLines.of(camera, projector, T_camera_projector), size)
+        if matched is None or not self._agrees(image, matched):
             return image.coords
         right = RIGHT.probability(matched.features) > LEAST_PROBABILITY
         kept = np.where(right[..., None], matched.coords, np.float32(np.nan))
-        least = round(SMALLEST_REGION * (size / factor) ** 2)
-        kept = drop_small_regions(kept, REGION_TEAR * period, least)
-        return enlarged(kept, factor, (image.mask.shape[0], image.mask.shape[1]), period)
+        return drop_small_regions(kept, REGION_TEAR * period, round(SMALLEST_REGION * size**2))
 
     def matched(self, image: DecodedImage, lines: EpipolarLines, size: float) -> MatchedImage | None:
         """Matches of all pixels; `size` is that of a period in the image. None where nothing that was decoded fits."""
@@ -150,15 +127,17 @@ class LineMatcher:
         period = self.pattern.period
         lines = with_offset(lines, image.coords, period, size)
         decoded = lines.nearest(image.coords)
-        tried = hypotheses(lines, image.coords, decoded, image.mask, period)
-        if tried is None:
+        w = hypotheses(lines, image.coords, decoded, image.mask, period)
+        if w is None:
             return None
+        numbers = numbers_of(decoded, w)
+        tried = TriedRanges.near(numbers, image.mask, len(w))
         sigma = COST_WINDOW * size
         statistics = image_statistics(image.grey, image.decoded, sigma)
         grid = self._sharpness(image, statistics, sigma)
-        matches = self._in_strips(image.grey, statistics, lines, numbers_of(decoded, tried), tried, grid, size)
-        w = tried[0] + matches.index.astype(np.float64) * (tried[1] - tried[0])
-        fitted = LineFit(grid, size).fitted(image.grey, lines, w)
+        matches = self._in_strips(image.grey, statistics, lines, w, tried, numbers, grid, size)
+        matched = w[0] + matches.index.astype(np.float64) * (w[1] - w[0])
+        fitted = LineFit(grid, size).fitted(image.grey, lines, matched, image.decoded)
         correlation = correlations(image.grey, statistics, fitted, grid, sigma)
         features = features_of(matches, fitted, correlation, image.coords, image.mask, period, size)
         return MatchedImage(fitted, features)
@@ -168,23 +147,25 @@ class LineMatcher:
         grey: Float32[ndarray, "h w"],
         statistics: Statistics,
         lines: EpipolarLines,
+        w: Float64[ndarray, "k"],
+        tried: TriedRanges,
         decoded: Int32[ndarray, "h w"],
-        tried: Float64[ndarray, "k"],
         grid: DrawnGrid,
         size: float,
     ) -> StereoMatches:
-        """Strips of rows that overlap, as high as memory allows."""
-        h, w = grey.shape
-        margin = round(STRIP_MARGIN * size)
-        rows = max(MOST_BYTES // (3 * w * len(tried)) - 2 * margin, margin, 1)
-        parts = []
-        for first in range(0, h, rows):
-            begin, end = max(first - margin, 0), min(first + rows + margin, h)
-            some = slice(begin, end)
-            there = statistics[0][some], statistics[1][some]
-            strip, sigma = lines.part((some, slice(None))), COST_WINDOW * size
-            costs = matching_costs(grey[some], there, strip, tried, grid, sigma)
-            parts.append(match_semi_globally(costs, decoded[some]).part(slice(first - begin, first - begin + rows)))
+        """Strips of rows of tiles that overlap, as high as memory allows."""
+        margin, height = -(-round(STRIP_MARGIN * size) // TILE), len(tried.count)
+        parts, first = [], 0
+        while first < height:
+            begin, end = max(first - margin, 0), first + 1
+            while end < height and 3 * tried.part(slice(begin, end + 1 + margin)).cells <= MOST_BYTES:
+                end += 1
+            tiles, rows = tried.part(slice(begin, end + margin)), slice(begin * TILE, (end + margin) * TILE)
+            there, strip = (statistics[0][rows], statistics[1][rows]), lines.part((rows, slice(None)))
+            costs = matching_costs(grey[rows], there, strip, w, tiles, grid, COST_WINDOW * size)
+            matches = match_semi_globally(costs, tiles, decoded[rows])
+            parts.append(matches.part(slice((first - begin) * TILE, (end - begin) * TILE)))
+            first = end
         return StereoMatches.joined(parts)
 
     def _sharpness(self, image: DecodedImage, statistics: Statistics, sigma: float) -> DrawnGrid:
@@ -228,14 +209,18 @@ class LineFit:
     pixels_a_period: float
 
     def fitted(
-        self, image: Float32[ndarray, "h w"], lines: EpipolarLines, w: Float64[ndarray, "h w"]
+        self,
+        image: Float32[ndarray, "h w"],
+        lines: EpipolarLines,
+        w: Float64[ndarray, "h w"],
+        decoded: Bool[ndarray, "h w"],
     ) -> Float32[ndarray, "h w 2"]:
-        """Coordinates; NaN in small regions."""
+        """Coordinates; NaN in small regions. Planes and shifts are those of the pixels that were `decoded`."""
         coords = lines.at(w)
         out = np.full_like(coords, np.nan)
         largest, least = TEAR * self.grid.period, LEAST_AREA * self.pixels_a_period**2
         for box, inside in large_regions(coords, largest, least):
-            out[box][inside] = self._region(image[box], lines.part(box), w[box], inside)[inside]
+            out[box][inside] = self._region(image[box], lines.part(box), w[box], inside, decoded[box])[inside]
         return out
 
     def _region(
@@ -244,16 +229,17 @@ class LineFit:
         lines: EpipolarLines,
         w: Float64[ndarray, "h w"],
         inside: Bool[ndarray, "h w"],
+        decoded: Bool[ndarray, "h w"],
     ) -> Float32[ndarray, "h w 2"]:
-        period, size = np.float32(self.grid.period), self.pixels_a_period
-        trust, light = inside.astype(np.float32), GridLight.even(image.shape)
+        period, size, light = np.float32(self.grid.period), self.pixels_a_period, GridLight.even(image.shape)
+        trust = (inside & decoded).astype(np.float32)
         slope = lines.slopes(w)
         steep = np.hypot(slope[..., 0], slope[..., 1])
-        flat = lines.at(self._smooth(w, inside, steep))
+        flat = lines.at(self._smooth(w, inside, trust, steep))
         # Where the image moves the matches, and flat again: steps of the inverse distance leave errors of their own.
         flat = flat + period * fit_shift(image, flat, trust, self.grid, light, size, SHIFT_WINDOW).shift
         light = measure_light(image, flat, trust, self.grid, size)
-        flat = lines.at(self._smooth(lines.nearest(flat), inside, steep))
+        flat = lines.at(self._smooth(lines.nearest(flat), inside, trust, steep))
         direction = slope / np.maximum(steep[..., None], np.float32(1e-12))
         total = np.zeros_like(flat)
         for _ in range(FIT_ROUNDS):
@@ -262,7 +248,11 @@ class LineFit:
         return flat + total * period
 
     def _smooth(
-        self, w: Float64[ndarray, "h w"], inside: Bool[ndarray, "h w"], slope: Float32[ndarray, "h w"]
+        self,
+        w: Float64[ndarray, "h w"],
+        inside: Bool[ndarray, "h w"],
+        trust: Float32[ndarray, "h w"],
+        slope: Float32[ndarray, "h w"],
     ) -> Float64[ndarray, "h w"]:
         """Inverse distances of planes that are near the pixel's own match, along its line."""
         unit = float(np.median(w[inside]))
@@ -273,7 +263,7 @@ class LineFit:
 
         windows = [(window * self.pixels_a_period, limit) for window, limit in SMOOTHING]
         both = np.dstack([scaled, scaled])  # planes are fitted to two values at a time
-        return flattened(both, inside, windows, is_near)[..., 0].astype(np.float64) * unit
+        return flattened(both, inside, trust, windows, is_near)[..., 0].astype(np.float64) * unit
 
 
 @compiled
@@ -326,7 +316,7 @@ class Logistic:
         return 1 / (1 + np.exp(-odds))
 
 
-RIGHT = Logistic(-3.697, (0.0923, -0.0068, 2.4458, -0.9122, 2.3262, 0.6447, 2.7155, 0.9038))
+RIGHT = Logistic(-4.081, (0.0741, -0.0053, 2.5316, -0.7949, 2.3923, 0.5960, 3.2449, 0.5606))
 
 
 def features_of(

@@ -28,7 +28,8 @@ from sl_nerfstudio.storage import locked, read_checked, remove_partial, write_ch
 T = TypeVar("T")
 
 VERSIONS = {
-    "matching": 1,  # along epipolar lines: matching/
+    "size of photographs": 1,  # decoding/grid.py, `shrink_factor`
+    "matching": 2,  # along epipolar lines: matching/
     "calibration": 1,  # the relative pose of a frame: relative_pose/ without the two below
     "projector": 1,  # estimated intrinsics: relative_pose/unknown_projector.py
     "test of intrinsics": 1,  # relative_pose/intrinsics.py

@@ -23,7 +23,15 @@ from sl_nerfstudio.pattern.layout import CENTRED, PatternLayout, SequenceName
 from sl_nerfstudio.processing.config import FEWEST_FRAMES
 from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError, unreadable
-from sl_nerfstudio.scan.images import ENDINGS, RAW, photograph_header, raw_file, read_photograph, turned_by_tag
+from sl_nerfstudio.scan.images import (
+    ENDINGS,
+    RAW,
+    Pixels,
+    photograph_header,
+    raw_file,
+    read_photograph,
+    turned_by_tag,
+)
 
 Size = tuple[int, int]  # (w, h)
 _LISTED = 5  # faults of a frame in a message
@@ -36,6 +44,11 @@ class CapturedFrame:
     name: str
     images: tuple[Path, ...]
     camera: str = ""  # the name of its camera; "" if there is only one
+    shrink: int = 1  # squares of so many pixels are read as one
+
+    def read(self, place: int) -> Pixels:
+        """One of the photographs at the size that is decoded. Raises FileError."""
+        return read_photograph(self.images[place], self.shrink)
 
 
 class SeveralFaults(FileError):
@@ -59,13 +72,17 @@ class Captures:
     """All frames, and the faults of those that cannot be used."""
 
     frames: tuple[CapturedFrame, ...]  # sorted by name, with numbers sorted as numbers; cameras take turns
-    sizes: dict[str, Size]  # of the images of each camera, by its name
+    sizes: dict[str, Size]  # of the photographs of each camera, by its name
     faults: dict[str, FileError]  # by the frame's name
 
     @property
     def size(self) -> Size:
         """The size of the first camera's images."""
         return next(iter(self.sizes.values()))
+
+    def shrunk(self, factor: int) -> "Captures":
+        """The same captures, to be read with squares of `factor` pixels as one."""
+        return replace(self, frames=tuple(replace(frame, shrink=factor) for frame in self.frames))
 
     def require_whole(self) -> list[CapturedFrame]:
         """The frames without faults. Raises the first fault if there are none."""

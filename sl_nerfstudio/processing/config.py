@@ -45,9 +45,12 @@ class ProcessConfig:
     the number of images says"""
     known_length: str | None = None
     """one true length: "baseline of frame 0 = 85 mm", or "distance between frame 3 (410.5, 200) and frame 7 (35, 80) =
-    50 mm" with pixels x, y; without it, the unit of the scan is arbitrary"""
+    50 mm" with pixels x, y of the photographs; without it, the unit of the scan is arbitrary"""
     not_mosaic: bool = False
     """the images are not raw mosaics of a colour filter (Bayer), although their pixels alternate like those"""
+    full_size: bool = False
+    """decode every pixel of the photographs; otherwise large ones are shrunk as they are read, to 12 pixels or more a
+    period of a coded grid, and so are their masks and colours"""
     unordered: bool = False
     """the frames were not captured in order around the object: try every pair"""
     poses: Path | None = None

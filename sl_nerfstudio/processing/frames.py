@@ -41,7 +41,7 @@ from sl_nerfstudio.relative_pose.estimation import (
 )
 from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError
-from sl_nerfstudio.scan.images import as_grey, read_photograph
+from sl_nerfstudio.scan.images import Pixels, as_grey
 
 # One frame by itself: decoding, the relative pose of the projector, matching along its lines, triangulation.
 
@@ -63,6 +63,7 @@ class FrameJob:
     cameras: dict[str, Device] = field(default_factory=dict)  # by name, if there are several; `camera` is the first
     stated: StatedSigma = field(default_factory=StatedSigma)  # how uncertain the files say the intrinsics are
     last_step: Step = "match"
+    shrink: int = 1  # by which photographs are shrunk when they are read; cameras and maps are of that size
 
     def camera_of(self, frame: CapturedFrame) -> Device:
         """The camera that took a frame."""
@@ -137,7 +138,7 @@ class FrameWorker:
             decoded = self._store.load(frame, key)
             resumed = decoded is not None
             if decoded is None:
-                decoded = self._store.save(frame, key, self._job.decoder.decode(frame.images))
+                decoded = self._decode(frame, key)
             result = replace(result, key=key, resumed=resumed, notes=decoded.notes)
             result = result.showing(self._selected(frame.name, decoded))
         except FileError as error:
@@ -146,6 +147,12 @@ class FrameWorker:
             return result.failed("decoding", self._with_file(frame, error))
         return result if self._job.last_step == "decode" else self._calibrated(result, decoded)
 
+    def _decode(self, frame: CapturedFrame, key: str) -> Decoded:
+        """Decode a frame, and store it; a single photograph with it, so that nothing needs to read that again."""
+        images = [frame.read(place) for place in range(len(frame.images))]
+        decoded = self._job.decoder.decode(images, [path.name for path in frame.images])
+        return self._store.save(frame, key, decoded, None if self._job.decoder.sequence else images[0])
+
     def calibrate(self, result: FrameStageResult) -> FrameStageResult:
         """The frame with its relative pose and cloud from all decoded coordinates, or left out with the reason."""
         return self._calibrated(result, self._stored(result, result.key))
@@ -153,6 +160,18 @@ class FrameWorker:
     def load(self, result: FrameStageResult) -> Decoded:
         """The maps of a frame, matched if it was, whichever worker stored them. Raises UserError if there are none."""
         return self.load_with_seen(result)[0]
+
+    def load_mask(self, result: FrameStageResult) -> Bool[ndarray, "h w"]:
+        """The mask of a frame like that of `load`, without its other maps."""
+        mask = self._store.load_mask(result.frame, result.matched or result.key)
+        if mask is None:
+            raise self._missing(result)
+        return mask if self._job.masks is None else mask & self._job.masks.of(result.name)
+
+    def image(self, result: FrameStageResult, place: int) -> Pixels:
+        """One of the photographs at the size that is decoded. Raises FileError."""
+        stored = self._store.load_image(result.frame, result.key) if result.key and place == 0 else None
+        return result.frame.read(place) if stored is None else stored
 
     def load_with_seen(self, result: FrameStageResult) -> tuple[Decoded, Bool[ndarray, "h w"]]:
         """Load the maps of a frame, and where the camera saw the pattern, whatever the user's mask selects."""
@@ -217,7 +236,7 @@ class FrameWorker:
         kept = self._store.load(frame, key)
         if kept is not None:
             return key, kept
-        grey = as_grey(read_photograph(frame.images[0]))
+        grey = as_grey(self.image(result, 0))
         coords = self._matcher.match(
             DecodedImage(grey, decoded.coords, decoded.mask), *devices, pose.T_camera_projector
         )
@@ -229,11 +248,14 @@ class FrameWorker:
     def _stored(self, result: FrameStageResult, key: str) -> Decoded:
         decoded = self._store.load(result.frame, key)
         if decoded is None:
-            raise UserError(
-                f"{self._job.work}: the decoded frame {result.name} is missing\n"
-                "    cause:  files were removed while sl-process was running\n    remedy: start again"
-            )
+            raise self._missing(result)
         return decoded
+
+    def _missing(self, result: FrameStageResult) -> UserError:
+        return UserError(
+            f"{self._job.work}: the decoded frame {result.name} is missing\n"
+            "    cause:  files were removed while sl-process was running\n    remedy: start again"
+        )
 
     def _selected(self, name: str, decoded: Decoded) -> Decoded:
         """What the user's mask of a frame selects; without masks, everything."""
@@ -248,15 +270,16 @@ class FrameWorker:
 # Worker processes that end with their parent, whatever ends it, and leave control-C to it.
 
 _EXIT_ORPHANED = 1
-_PROCESS, _PIXEL = 1.4e9, 200  # bytes that decoding a photograph takes: of any size, and for each of its pixels
+_PROCESS, _PIXEL = 1.4e9, 200  # bytes that decoding a photograph takes: of any size, and for each pixel that is decoded
+_READ = 15  # bytes for each pixel of a photograph while it is read
 _MAIN_PROCESS = 1.0e9  # bytes of the process that collects the results, without the clouds that it may keep
 _FOR_PROCESSES = 0.85  # share of the memory that is left to the processes
 
 
-def default_processes(pixels: int, memory: int) -> int:
+def default_processes(pixels: int, memory: int, shrink: int = 1) -> int:
     """One for each core, but not more than `memory` (bytes) is enough for; `pixels` of the largest photograph."""
     room = _FOR_PROCESSES * memory - _MAIN_PROCESS
-    return max(1, min(cores(), int(room / (_PROCESS + _PIXEL * pixels))))
+    return max(1, min(cores(), int(room / (_PROCESS + max(_READ, _PIXEL / shrink**2) * pixels))))
 
 
 @contextmanager
@@ -309,12 +332,17 @@ def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) ->
         if frame.name in captures.faults
     }
     todo = [frame for frame in captures.frames if frame.name not in found]
-    settings = {"decoder": job.decoder.name, "pattern": str(config.pattern), "images": str(config.images)}
+    settings = {
+        "decoder": job.decoder.name,
+        "decoder_version": job.decoder.version,
+        "pattern": str(config.pattern),
+        "images": str(config.images),
+    }
     if job.masks is not None:
         settings |= {"masks": str(job.masks.folder), "masks_digest": job.masks.digest}
     manifest = Manifest(job.work, settings)
     largest = max((w * h for w, h in captures.sizes.values()), default=0)
-    jobs, clouds = config.jobs or default_processes(largest, memory_of_process()), LargeClouds()
+    jobs, clouds = config.jobs or default_processes(largest, memory_of_process(), job.shrink), LargeClouds()
     with closing(run_frames(job, todo, jobs)) as ready:  # an exception here ends the workers, too
         for result in track(ready, "decoding and calibrating", len(todo)):
             found[result.name] = with_kept_cloud(result, clouds)

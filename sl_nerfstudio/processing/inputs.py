@@ -1,6 +1,7 @@
 """The files and flags of a run, read and checked before the long work starts."""
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,9 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import Similarity, fit_similarity
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import PatternLayout
+from sl_nerfstudio.processing.cache import StageStore
 from sl_nerfstudio.processing.captures import (
+    CapturedFrame,
     Captures,
     describe_sequence,
     find_captures,
@@ -39,14 +42,14 @@ from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
 from sl_nerfstudio.processing.frames import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_kept_cloud
 from sl_nerfstudio.processing.masks import find_masks
 from sl_nerfstudio.processing.pictures import find_pictures, picture_sentences
-from sl_nerfstudio.processing.records import LargeClouds
+from sl_nerfstudio.processing.records import DecodedStore, LargeClouds
 from sl_nerfstudio.processing.video import VideoChoice, is_video, video_frames
 from sl_nerfstudio.registration.result import KnownLength, is_index, parse_known_length
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from sl_nerfstudio.relative_pose.intrinsics import CameraEstimate, estimate_camera
 from sl_nerfstudio.relative_pose.joint_fit import FrameMatches
 from sl_nerfstudio.scan.document import Faults, Fields, FileError, document_faults, frame_label, read_document
-from sl_nerfstudio.scan.images import refuse_mosaic
+from sl_nerfstudio.scan.images import read_photograph, refuse_mosaic
 from sl_nerfstudio.scan.read import POSES, read_pose
 from sl_nerfstudio.scan.types import UNITS
 
@@ -72,6 +75,10 @@ class Cameras:
     def several(self) -> dict[str, Device]:
         """The cameras by name if there are several; otherwise empty."""
         return {} if "" in self.devices else self.devices
+
+    def shrunk(self, factor: int) -> "Cameras":
+        """The cameras of the captures as they are read."""
+        return replace(self, devices={name: device.shrunk(factor) for name, device in self.devices.items()})
 
 
 def read_cameras(config: ProcessConfig, captures: Captures) -> Cameras:
@@ -159,7 +166,7 @@ def refine_camera(
         ]
     if found is None:
         raise ValueError("no frame has a pose")
-    notes = CameraNotes(start, found)
+    notes = CameraNotes(start, replace(found, camera=found.camera.scaled(float(job.shrink))))
     log(notes.sentence())
     return replace(refined, last_step="match"), again, notes
 
@@ -233,6 +240,7 @@ class CaptureNotes:
     sequence: str | None = None  # names of the order of a Gray code
     recognised: bool = False  # the order, from the images
     video: VideoChoice | None = None
+    shrink: int = 1  # squares of so many pixels of the photographs are read as one
     camera: dict[str, Any] | None = None  # figures of a camera that no file describes
 
     def with_camera(self, sentence: str, figures: dict[str, Any]) -> "CaptureNotes":
@@ -243,7 +251,7 @@ class CaptureNotes:
         """Return the figures as JSON."""
         video = None if self.video is None else self.video.document()
         names = {"sequence": self.sequence, "sequence_recognised": self.recognised}
-        return {**names, "video": video, "camera_focal": self.camera}
+        return {**names, "video": video, "shrunk_by": self.shrink, "camera_focal": self.camera}
 
 
 @dataclass(frozen=True)
@@ -316,6 +324,45 @@ def _refuse_mosaics(captures: Captures) -> None:
             images = whole[0].images
             for path in dict.fromkeys((images[0], images[len(images) // 2], images[-1])):
                 refuse_mosaic(path)
+
+
+# The size at which photographs are read: one for all of them.
+
+_SEEN = 3  # photographs of each camera that are looked at
+
+
+def shrink_factor(captures: Captures, decoder: Decoder[Any], work: Path) -> int:
+    """The largest factor with which all photographs that are looked at have enough pixels for the decoder.
+
+    Those are the first, the middle and the last of each camera.
+    """
+    if decoder.sequence:
+        return 1
+    looked_at: list[CapturedFrame] = []
+    for camera in captures.sizes:
+        frames = [f for f in captures.frames if f.camera == camera and f.name not in captures.faults]
+        places = np.unique(np.linspace(0, len(frames) - 1, min(_SEEN, len(frames))).astype(int))
+        looked_at += [frames[place] for place in places]
+    store = DecodedStore(work, decoder.key)
+    inputs = [store.key(frame) for frame in looked_at]
+
+    def measure() -> int:
+        found = []
+        for frame in looked_at:
+            with suppress(FileError):  # said when the frame is decoded
+                found.append(decoder.shrink_factor(read_photograph(frame.images[0])))
+        return min((factor for factor in found if factor is not None), default=1)
+
+    return StageStore(work).kept("size of photographs", inputs, measure)
+
+
+def _shrunk_sentence(captures: Captures, factor: int) -> str:
+    """How large the photographs are, and as how large they are read."""
+    (w, h), (own_w, own_h) = captures.size, (side // factor for side in captures.size)
+    return (
+        f"photographs of {w} x {h} pixels are read as {own_w} x {own_h}, which is enough for this pattern "
+        f"(shrunk by {factor}); --full-size decodes every pixel"
+    )
 
 
 # Rough camera poses from a transforms.json, from which registration starts.
@@ -444,15 +491,22 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     said = picture_sentences(pictures, captures) if pictures else ()
     doubt = StatedSigma(cameras.sigma, read_projector_sigma(config, (layout.w, layout.h)) if stated else CERTAIN)
     last_step = "decode" if config.finds_projector else "match" if cameras.start is None else "calibrate"
+    given = None if config.poses is None else read_given_poses(config.poses, names)
+    known = None if known is None else frames_by_name(known, names)
+    # Everything that was given fits together: now photographs are read.
+    shrink = 1 if config.full_size else shrink_factor(captures, decoder, config.work_folder)
+    cameras, captures = cameras.shrunk(shrink), captures.shrunk(shrink)
+    said = ((_shrunk_sentence(captures, shrink),) if shrink > 1 else ()) + said
+    masks = None if masks is None else replace(masks, shrink=shrink)
     devices = cameras.first, projector
     return Inputs(
-        FrameJob(config.work_folder, decoder, *devices, config.seed, masks, cameras.several, doubt, last_step),
+        FrameJob(config.work_folder, decoder, *devices, config.seed, masks, cameras.several, doubt, last_step, shrink),
         cameras,
         captures,
         stated,
-        None if config.poses is None else read_given_poses(config.poses, names),
-        None if known is None else frames_by_name(known, names),
-        replace(captured.notes, sentences=(*captured.notes.sentences, *said)),
+        given,
+        None if known is None else known.shrunk(shrink),
+        replace(captured.notes, sentences=(*captured.notes.sentences, *said), shrink=shrink),
         pictures,
     )
 

@@ -17,7 +17,7 @@ from sl_nerfstudio.decoding.decoder import Decoded, DecodingError
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError, read_bytes, unreadable
-from sl_nerfstudio.scan.images import FORMATS, read_image
+from sl_nerfstudio.scan.images import FORMATS, read_image, shrunk
 
 # One mask as a user makes it: white is used, black is not.
 
@@ -101,13 +101,10 @@ class UserMasks:
     sizes: dict[str, tuple[int, int]]  # (w, h) by the frame's name
     files: dict[str, Path]  # by the frame's name
     digests: dict[str, str]
+    shrink: int = 1  # by which the captures are shrunk when they are read
 
-    def applied(self, frame: str, decoded: Decoded) -> Decoded:
-        """A decoded frame without what is outside its mask.
-
-        Stored frames are not masked, so that other masks need no decoding. Raises DecodingError if nothing decoded is
-        inside the mask, UserError if the mask is another one than at the start of the run.
-        """
+    def of(self, frame: str) -> Bool[ndarray, "h w"]:
+        """The mask of a frame as its capture is read. Raises UserError if it is another one than at the beginning."""
         path = self.files[frame]
         mask = read_mask(path, self.sizes[frame])
         if _digest(mask) != self.digests[frame]:
@@ -115,6 +112,15 @@ class UserMasks:
                 f"{path}: was changed while sl-process was running\n    cause:  another program wrote it\n"
                 "    remedy: start again; decoded frames are kept"
             )
+        return shrunk(255 * mask.astype(np.uint8), self.shrink) >= 128
+
+    def applied(self, frame: str, decoded: Decoded) -> Decoded:
+        """A decoded frame without what is outside its mask.
+
+        Stored frames are not masked, so that other masks need no decoding. Raises DecodingError if nothing decoded is
+        inside the mask, UserError if the mask is another one than at the start of the run.
+        """
+        path, mask = self.files[frame], self.of(frame)
         if not (decoded.decoded & mask).any():
             raise DecodingError(
                 f"no decoded pixel is inside its mask, {path}", "the mask belongs to another frame, or is inverted",
@@ -131,10 +137,11 @@ class UserMasks:
         return hashlib.sha256(lines.encode()).hexdigest()[:24]
 
 
-def find_masks(folder: Path, frames: dict[str, tuple[int, int]]) -> UserMasks:
+def find_masks(folder: Path, frames: dict[str, tuple[int, int]], shrink: int = 1) -> UserMasks:
     """The masks of all frames, each read and checked. `frames` are the sizes (w, h) of the captures by their names.
 
-    Raises FileError that names all frames without a mask, or all masks that cannot be used.
+    A square of `shrink` pixels is used if half of it is. Raises FileError that names all frames without a mask, or all
+    masks that cannot be used.
     """
     if not os.path.isdir(folder):  # Path.is_dir raises for a name that is too long
         raise FileError(folder, "is no folder", "a typing error in --masks", "give the folder with the masks")
@@ -164,7 +171,7 @@ def find_masks(folder: Path, frames: dict[str, tuple[int, int]]) -> UserMasks:
             "keep one of them",
         )
     used = {name: files[name] for name in frames}
-    return UserMasks(folder, frames, used, _checked(used, frames))
+    return UserMasks(folder, frames, used, _checked(used, frames), shrink)
 
 
 def _checked(files: dict[str, Path], sizes: dict[str, tuple[int, int]]) -> dict[str, str]:

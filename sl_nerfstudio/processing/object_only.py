@@ -76,7 +76,7 @@ def find_object_only(
             devices = poses.adjusted.poses
             frames.append(DecodedFrame(
                 cloud.camera, cloud.projector, devices.T_world_camera[k], devices.T_world_projector[k], cloud.coords,
-                worker.load(by_name[cloud.name]).mask,
+                worker.load_mask(by_name[cloud.name]),
             ))  # fmt: skip
     found = separate(frames, job.seed)
     parts = {

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, UInt8, UInt16
+from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.console import phase, track
@@ -64,6 +64,7 @@ from sl_nerfstudio.processing.projector import (
     with_equal_baselines,
     within_stated_doubt,
 )
+from sl_nerfstudio.processing.records import of_earlier_version
 from sl_nerfstudio.processing.result import ProcessResult, first_line, left_out, summarise
 from sl_nerfstudio.processing.scan_poses import ScanPoses, find_scan_poses, require_known_frames
 from sl_nerfstudio.processing.turntable import MASKS, agrees_with_itself, moving_part, only_moving
@@ -73,7 +74,7 @@ from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.review.agreement import SurfaceShares, missing_shares, shared_surface
 from sl_nerfstudio.review.moving_part import MovingPart
 from sl_nerfstudio.scan.document import FileError
-from sl_nerfstudio.scan.images import read_photograph
+from sl_nerfstudio.scan.images import Pixels, read_photograph
 from sl_nerfstudio.scan.write import ScanWriter, encode_json
 from sl_nerfstudio.storage import NewFolder, write_atomic
 
@@ -169,13 +170,14 @@ def write_scan(
         units=poses.units,
         scale=poses.scale,
         projector=job.projector,
+        extra={"sl_shrunk_by": job.shrink} if job.shrink > 1 else None,
         projector_extra=None if result.projector is None else {"intrinsics_sigma": result.projector.sigmas()},
         pattern=np.rint(255 * layout.render(_SUPERSAMPLING)).astype(np.uint8),
         camera=job.camera,
         within=folder,
     ) as writer:
         for frame, record in zip(track(results, "writing"), result.frames, strict=True):
-            image = _image(frame, shown)
+            image = _image(worker, frame, shown)
             cloud = frame.cloud
             part = None if result.object_only is None else result.object_only.parts.get(frame.name)
             previews.append(make_preview(image, None if cloud is None else cloud.coords, size, part, len(results)))
@@ -190,7 +192,7 @@ def write_scan(
                 coords=np.where(keep[..., None], cloud.coords, np.float32(np.nan)),
                 mask=decoded.mask & keep,
                 pattern=np.rint(255 * decoded.pattern * keep).astype(np.uint8),
-                color=None if picture is None else read_photograph(picture),
+                color=None if picture is None else read_photograph(picture, job.shrink),
                 image_is_color=white is not None and not pictures,
                 camera=job.camera_of(frame.frame) if job.cameras else None,
                 T_world_camera=poses.adjusted.poses.T_world_camera[k],
@@ -202,10 +204,10 @@ def write_scan(
         writer.add_file(REPORT, make_report(result, previews).encode())
 
 
-def _image(frame: FrameStageResult, shown: int) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"] | None:
+def _image(worker: FrameWorker, frame: FrameStageResult, shown: int) -> Pixels | None:
     """The capture (of a sequence the image in full light, by its place); None if it cannot be read."""
     try:
-        return read_photograph(frame.frame.images[shown])
+        return worker.image(frame, shown)
     except (FileError, IndexError):
         return None
 
@@ -240,6 +242,8 @@ def _process(
         log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
         for sentence in (*inputs.notes.sentences, *(f"left out: {fault}" for fault in describe_faults(captures))):
             log(sentence)
+        if of_earlier_version(config.work_folder, inputs.job.decoder):
+            log(f"{config.work_folder} was filled by an earlier version: its frames are decoded again")
         digest = digest_of_captures(captures)
         if earlier is not None:
             earlier.require_same(digest, config.output)
@@ -427,7 +431,7 @@ def _surface_shares(
     index, worker = np.flatnonzero(registration.registered), FrameWorker(job)
     frames, clouds = [result for result in results if result.cloud is not None], clouds_of(results)
     cameras, chosen = [job.camera_of(frames[k].frame) for k in index], poses[index]
-    coords, seen = (clouds[k].coords for k in index), (worker.load(frames[k]).mask for k in index)
+    coords, seen = (clouds[k].coords for k in index), (worker.load_mask(frames[k]) for k in index)
     masks = seen if parts is None else (m & parts.keeps(frames[k].name) for k, m in zip(index, seen, strict=True))
     shared = shared_surface(cameras, job.projector, chosen, coords, masks)
     missing = missing_shares(cameras, job.projector, chosen, shared.points, (clouds[k].seen for k in index))

@@ -108,9 +108,12 @@ def doubt_sentence(found: ProjectorEstimate) -> str:
     )
 
 
-def wrong_intrinsics(evidence: IntrinsicsEvidence) -> str:
-    """Which intrinsics the frames contradict, and the values with which they agree."""
-    found = evidence.explanations()
+def wrong_intrinsics(evidence: IntrinsicsEvidence, shrink: int = 1) -> str:
+    """Which intrinsics the frames contradict, and the values with which they agree: of photographs before `shrink`."""
+    found = [
+        replace(one, device=one.device.scaled(float(shrink))) if one.role == "camera" else one
+        for one in evidence.explanations()
+    ]
     chi_square = min(evidence.projector.chi_square, evidence.camera.chi_square)
     head = (
         "The stated intrinsics contradict the captures (epipolar geometry of all frames together: chi square "
@@ -472,7 +475,7 @@ def contradiction_by_epipolar_geometry(job: FrameJob, results: Sequence[FrameSta
     evidence = evidence.allowing(job.stated.either)
     stated_px, best_px = evidence.projector.noise_px
     decisive = len(firm) >= FEWEST_FRAMES or best_px < _DECISIVE * stated_px
-    return wrong_intrinsics(evidence) if decisive and evidence.contradicts() else ""
+    return wrong_intrinsics(evidence, job.shrink) if decisive and evidence.contradicts() else ""
 
 
 _REPEATED_PX = 1.0  # pattern pixels, within which a pixel shows in two frames what it showed before

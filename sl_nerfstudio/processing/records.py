@@ -16,14 +16,15 @@ import torch
 from jaxtyping import Bool, Float16, Float32, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.decoder import Decoded
+from sl_nerfstudio.decoding.decoder import Decoded, Decoder
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import CapturedFrame
 from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, RelativePose
 from sl_nerfstudio.scan.document import read_bytes
+from sl_nerfstudio.scan.images import ARRAY_DAMAGE, Pixels
 from sl_nerfstudio.scan.write import encode_json
-from sl_nerfstudio.storage import in_file, largest_in_memory, read_checked, write_atomic, write_checked
+from sl_nerfstudio.storage import encode_npz, in_file, largest_in_memory, read_checked, write_atomic, write_checked
 
 # Decoded frames that are kept between runs: only changed images, patterns or decoders need decoding again.
 
@@ -41,7 +42,7 @@ class DecodedStore:
 
     def key(self, frame: CapturedFrame) -> str:
         """Digest of the images' contents and of the decoder. Raises FileError if an image cannot be read."""
-        digest = hashlib.sha256(self._decoder_key.encode())
+        digest = hashlib.sha256(f"{self._decoder_key} {frame.shrink}".encode())
         for path in frame.images:
             digest.update(hashlib.sha256(read_bytes(path)).digest())
         return digest.hexdigest()[:KEY_LENGTH]
@@ -65,15 +66,33 @@ class DecodedStore:
             return None
         return _restored(coords, mask, pattern, light, notes)
 
-    def save(self, frame: CapturedFrame, key: str, decoded: Decoded) -> Decoded:
-        """Store a frame, and return it as `load` will, so that a resumed run gives the same result."""
-        buffer = BytesIO()
+    def load_mask(self, frame: CapturedFrame, key: str) -> Bool[ndarray, "h w"] | None:
+        """The mask alone of a frame that was decoded before."""
+        return self._member(frame, key, "mask")
+
+    def load_image(self, frame: CapturedFrame, key: str) -> Pixels | None:
+        """The photograph that was stored with a decoded frame; None if none was."""
+        return self._member(frame, key, "image")
+
+    def _member(self, frame: CapturedFrame, key: str, name: str) -> ndarray | None:
+        """One array of a file, whose own sum is checked; None if it is missing or damaged."""
+        try:
+            with np.load(self._path(frame, key), allow_pickle=False) as stored:
+                return stored[name]
+        except ARRAY_DAMAGE:
+            return None
+
+    def save(self, frame: CapturedFrame, key: str, decoded: Decoded, image: Pixels | None = None) -> Decoded:
+        """Store a frame, and return it as `load` will, so that a resumed run gives the same result.
+
+        `image` is its photograph at the size that was decoded.
+        """
         pattern = np.rint(65535 * decoded.pattern).astype(np.uint16)
         light = None if decoded.light is None else decoded.light.astype(np.float16)
-        more = {} if light is None else {"light": light}
-        notes = np.array(decoded.notes, dtype=np.str_)
-        np.savez_compressed(buffer, coords=decoded.coords, mask=decoded.mask, pattern=pattern, notes=notes, **more)
-        write_checked(self._path(frame, key), buffer.getvalue())
+        arrays = {"coords": decoded.coords, "mask": decoded.mask, "pattern": pattern, "light": light, "image": image}
+        arrays["notes"] = np.array(decoded.notes, dtype=np.str_)
+        content = encode_npz({name: array for name, array in arrays.items() if array is not None})
+        write_checked(self._path(frame, key), content)
         return _restored(decoded.coords, decoded.mask, pattern, light, decoded.notes)
 
     def _path(self, frame: CapturedFrame, key: str) -> Path:
@@ -92,26 +111,33 @@ def _restored(
     return Decoded(coords, mask, values, None if light is None else light.astype(np.float32), notes)
 
 
+def of_earlier_version(root: Path, decoder: Decoder[Any]) -> bool:
+    """Whether a work folder holds frames, and another version of this decoder has decoded them."""
+    settings = _manifest(root / MANIFEST).get("settings", {})
+    return settings.get("decoder") == decoder.name and settings.get("decoder_version") != decoder.version
+
+
 class Manifest:
     """What happened to each frame, in words, in the folder of the decoded frames; written after every frame."""
 
     def __init__(self, root: Path, settings: dict[str, Any]) -> None:
         self._path = root / MANIFEST
         self._settings = settings
-        self._frames = self._known()
+        self._frames = dict(_manifest(self._path).get("frames", {}))
 
     def note(self, frame: str, key: str, status: str, reason: str = "") -> None:
         """Note what happened to a frame."""
         self._frames[frame] = {"key": key, "status": status, **({"reason": reason} if reason else {})}
         write_atomic(self._path, encode_json({"settings": self._settings, "frames": self._frames}))
 
-    def _known(self) -> dict[str, Any]:
-        """The notes of an earlier run; none if there are none that can be read."""
-        try:
-            frames = json.loads(self._path.read_text(encoding="utf-8"))["frames"]
-        except (OSError, ValueError, KeyError, TypeError):
-            return {}
-        return dict(frames) if isinstance(frames, dict) else {}
+
+def _manifest(path: Path) -> dict[str, dict[str, Any]]:
+    """The objects in the notes of an earlier run; none if there are none that can be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return {k: v for k, v in found.items() if isinstance(v, dict)} if isinstance(found, dict) else {}
 
 
 # Dataclasses with arrays as bytes, exactly, and without pickle: reading them runs no code.
@@ -124,10 +150,8 @@ def encode(value: object) -> bytes:
     """Dataclasses, tuples, lists, arrays, tensors, numbers and texts as an archive. Raises TypeError for others."""
     arrays: list[ndarray] = []
     tree = json.dumps(_flat(value, arrays))
-    buffer = BytesIO()
     members = {f"array{k}": array for k, array in enumerate(arrays)}
-    np.savez_compressed(buffer, **{_TREE: np.frombuffer(tree.encode(), np.uint8)}, **members)
-    return buffer.getvalue()
+    return encode_npz({_TREE: np.frombuffer(tree.encode(), np.uint8), **members})
 
 
 def decode(content: bytes, classes: Sequence[type]) -> Any:

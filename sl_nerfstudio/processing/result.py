@@ -505,7 +505,10 @@ def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames
     clouds = clouds_of(results)
     if adjusted is None or not clouds or repeat_each_other(adjusted.poses, clouds):
         return ""
-    return contradiction(adjusted.intrinsics, [cloud.camera for cloud in clouds], clouds[0].projector)
+    cameras = [
+        cloud.camera.scaled(float(result.frame.shrink)) for result in results if (cloud := result.cloud) is not None
+    ]
+    return contradiction(adjusted.intrinsics, cameras, clouds[0].projector)
 
 
 def repeat_each_other(poses: DevicePoses, clouds: Sequence[FrameCloud]) -> bool:

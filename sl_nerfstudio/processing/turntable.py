@@ -17,7 +17,7 @@ from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError
 from sl_nerfstudio.review.moving_part import MovingPart, find_moving_part, in_one_place
 from sl_nerfstudio.review.verdict import cross_reasons, worst
-from sl_nerfstudio.scan.images import encode_png
+from sl_nerfstudio.scan.images import encode_png, photograph_header
 from sl_nerfstudio.storage import write_atomic
 
 MASKS = "moving"  # folder of the masks, in the work folder
@@ -50,10 +50,11 @@ def only_moving(frames: CalibratedFrames, part: MovingPart, rigid: bool) -> Cali
         except RelativePoseError:
             results.append(result.failed("registering", _NOTHING_MOVES.format(result.frame.images[0])))
             continue
-        write_mask(folder / f"{result.name}.png", mask)
-        sizes[result.name] = mask.shape[1], mask.shape[0]
+        header = photograph_header(result.frame.images[0])
+        sizes[result.name] = header.w, header.h
+        write_mask(folder / f"{result.name}.png", _as_photographed(mask, sizes[result.name], result.frame.shrink))
         results.append(result)
-    masks = find_masks(folder, sizes) if sizes else frames.job.masks
+    masks = find_masks(folder, sizes, frames.job.shrink) if sizes else frames.job.masks
     by_name = {result.name: result for result in results}
     return replace(
         frames, job=replace(frames.job, masks=masks), results=[by_name[result.name] for result in frames.results]
@@ -71,6 +72,14 @@ def write_mask(path: Path, mask: Bool[ndarray, "h w"]) -> None:
     """Write the mask of a frame, white where it is used."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomic(path, encode_png(255 * mask.astype(np.uint8)))
+
+
+def _as_photographed(mask: Bool[ndarray, "a b"], size: tuple[int, int], shrink: int) -> Bool[ndarray, "h w"]:
+    """The mask of a photograph of `size` (w, h) that was read with squares of `shrink` pixels as one."""
+    whole = np.zeros(size[::-1], dtype=bool)
+    large = mask.repeat(shrink, axis=0).repeat(shrink, axis=1)
+    whole[: large.shape[0], : large.shape[1]] = large
+    return whole
 
 
 def _masked(cloud: FrameCloud, mask: Bool[ndarray, "h w"]) -> FrameCloud:

@@ -187,6 +187,10 @@ class KnownLength:
     frames: tuple[str, ...]  # number or name of the frame, or of the two frames
     pixels: tuple[tuple[float, float], ...] = ()  # picked in them, (x, y); the centre of the first pixel is (.5, .5)
 
+    def shrunk(self, factor: int) -> "KnownLength":
+        """The same in images whose squares of `factor` pixels are one."""
+        return replace(self, pixels=tuple((x / factor, y / factor) for x, y in self.pixels))
+
     @property
     def source(self) -> str:
         """Words for where the scale of a scan comes from."""

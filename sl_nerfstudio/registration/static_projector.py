@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.least_squares import BlockEquations, minimise
@@ -501,7 +501,7 @@ def _noise(r: Float64[ndarray, "n 2"], scene: StaticScene) -> float:
     free = 3 * len(scene.points)
     lost = np.sqrt(r.size / max(r.size - free, 1))
     size = float(np.quantile(np.abs(r), NOISE_QUANTILE))
-    return max(lost * size / float(norm.ppf((1 + NOISE_QUANTILE) / 2)), NOISE_FLOOR_PX)
+    return max(lost * size / float(ndtri((1 + NOISE_QUANTILE) / 2)), NOISE_FLOOR_PX)
 
 
 @dataclass(frozen=True)

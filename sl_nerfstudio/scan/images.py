@@ -24,6 +24,7 @@ from PIL.PngImagePlugin import PngImageFile
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.scan.document import FileError, check_file, read_bytes, unreadable
+from sl_nerfstudio.storage import encode_npz
 
 # Images of a scan: grey or RGB, 8 or 16 bit.
 
@@ -299,17 +300,27 @@ _GREENS = 0.3  # of that contrast: between the two green classes
 _SHARE = 0.7  # of the tiles
 
 
-def read_photograph(path: Path) -> Pixels:
-    """All pixels, (h, w) grey or (h, w, 3) RGB, 8 or 16 bit, turned as the EXIF tag says.
+def read_photograph(path: Path, shrink: int = 1) -> Pixels:
+    """All pixels, (h, w) grey or (h, w, 3) RGB, 8 or 16 bit, turned as the EXIF tag says, then `shrunk`.
 
     Raises FileError for what cannot be read, and for raw files, with the command that converts them.
     """
     if path.suffix.lower() in RAW:
         raise raw_file(path)
     if path.suffix.lower() in PHONE:
-        return np.asarray(_open_heif(path).to_pillow().convert("RGB"))
+        return shrunk(np.asarray(_open_heif(path).to_pillow().convert("RGB")), shrink)
     pixels, orientation = read_pixels_and_orientation(path, photograph=True)
-    return turned(pixels, orientation)
+    return shrunk(turned(pixels, orientation), shrink)
+
+
+def shrunk(pixels: Pixels, factor: int) -> Pixels:
+    """Means over squares of `factor` pixels, of the same type; rows and columns that fill no square are left out."""
+    import cv2
+
+    if factor == 1:
+        return pixels
+    h, w = pixels.shape[0] // factor, pixels.shape[1] // factor
+    return cv2.resize(pixels[: h * factor, : w * factor], (w, h), interpolation=cv2.INTER_AREA)  # type: ignore[return-value]
 
 
 def photograph_header(path: Path) -> ImageHeader:
@@ -472,9 +483,7 @@ def read_coords(path: Path) -> Float32[ndarray, "h w 2"]:
 
 def encode_coords(coords: Float32[ndarray, "h w 2"]) -> bytes:
     """A compressed .npz file of the coordinates."""
-    buffer = BytesIO()
-    np.savez_compressed(buffer, **{KEY: coords})
-    return buffer.getvalue()
+    return encode_npz({KEY: coords})
 
 
 @contextmanager

@@ -263,7 +263,7 @@ def _same_poses(a: PartialFrame, b: PartialFrame) -> bool:
 
 # transforms.json as a whole: what could be read of a scan, and everything that could not.
 
-_TOP_KEYS = ("sl_format", "units", *CAMERA_KEYS, "projector", "scale", "frames", "sl_pose_sigma")
+_TOP_KEYS = ("sl_format", "units", *CAMERA_KEYS, "projector", "scale", "frames", "sl_pose_sigma", "sl_shrunk_by")
 
 _NO_PROJECTOR = Problem(
     "is missing: there is no projector in this data set",
@@ -282,13 +282,16 @@ class PartialScan:
     projector: Device | None = None
     pattern_path: Path | None = None
     frames: list[PartialFrame] = field(default_factory=list)
+    shrunk_by: int = 1
 
     def complete(self) -> Scan:
         """The scan, if no fault was found. Raises ValueError if a value is missing."""
         if self.units is None or self.scale is None or self.projector is None or self.pattern_path is None:
             raise ValueError("a scan with faults cannot be completed")
         frames = tuple(frame.complete() for frame in self.frames)
-        return Scan(self.root, self.units, self.scale, self.projector, self.pattern_path, frames)
+        return Scan(
+            self.root, self.units, self.scale, self.projector, self.pattern_path, frames, shrunk_by=self.shrunk_by
+        )
 
 
 def read_partial_scan(root: Path, faults: Faults, need_coords: bool = True) -> PartialScan:
@@ -311,6 +314,8 @@ def read_partial_scan(root: Path, faults: Faults, need_coords: bool = True) -> P
             "sl_format", f"is {number:g}", "it was written by a newer version of this package", "update the package"
         )
     partial.units = top.read_choice("units", list(UNITS), "an unknown unit of length")
+    if "sl_shrunk_by" in document:
+        partial.shrunk_by = top.read_count("sl_shrunk_by") or 1
     section = top.read_section("projector")
     if section is not None:
         section.check_spelling(PROJECTOR_KEYS)

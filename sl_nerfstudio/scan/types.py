@@ -263,6 +263,7 @@ class Scan:
     pattern_path: Path
     frames: tuple[Frame, ...]
     intrinsics_change: IntrinsicsChange = UNCHANGED  # of these devices relative to those in transforms.json
+    shrunk_by: int = 1  # squares of so many pixels of the photographs are one of the images
 
     @property
     def poses(self) -> DevicePoses:

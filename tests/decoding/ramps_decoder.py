@@ -1,13 +1,12 @@
 """A third decoder for tests: brightness is the coordinate."""
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
 from sl_nerfstudio.decoding.decoder import Decoded, Decoder, DecodingError
-from sl_nerfstudio.scan.images import as_grey, read_image
+from sl_nerfstudio.scan.images import Pixels, as_grey
 from tests.pattern.ramps import Ramps
 
 
@@ -19,10 +18,10 @@ class RampsDecoder(Decoder[Ramps]):
     reads: ClassVar[str] = Ramps.kind
     sequence: ClassVar[bool] = True
 
-    def decode(self, paths: Sequence[Path]) -> Decoded:
-        if len(paths) != 2:
-            raise DecodingError(f"holds {len(paths)} images, not 2", "some are missing", "give both")
-        x, y = (as_grey(read_image(path)) for path in paths)
+    def decode(self, images: Sequence[Pixels], names: Sequence[str]) -> Decoded:
+        if len(images) != 2:
+            raise DecodingError(f"holds {len(images)} images, not 2", "some are missing", "give both")
+        x, y = map(as_grey, images)
         mask = x > 0
         if not mask.any():
             raise DecodingError("is black", "the projector was off", "switch it on")

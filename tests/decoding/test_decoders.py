@@ -12,7 +12,6 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import LAYOUTS
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
-from sl_nerfstudio.scan.images import encode_png
 from tests.decoding.gray_captures import LAYOUT, exact_coords, photographs
 from tests.decoding.ramps_decoder import RampsDecoder
 from tests.pattern.ramps import Ramps
@@ -21,11 +20,7 @@ GRID = GridPattern(w=160, h=120)
 GRAY = GrayCode(32, 24, 2)
 
 
-def write_images(folder, images):
-    paths = [folder / f"{k:02d}.png" for k in range(len(images))]
-    for path, image in zip(paths, images, strict=True):
-        path.write_bytes(encode_png(image))
-    return paths
+NAMES = [f"{k:02d}.png" for k in range(LAYOUT.images)]
 
 
 def test_every_kind_of_pattern_has_a_default_decoder(tmp_path):
@@ -89,11 +84,10 @@ def test_creating_a_decoder_loads_no_network_and_it_can_be_sent_to_another_proce
     assert again.key == decoder.key and np.array_equal(again.layout.codes, GRID.codes)
 
 
-def test_the_network_decoder_reads_the_one_image_of_a_frame(tmp_path):
+def test_the_network_decoder_reads_the_one_image_of_a_frame():
     grid = GridPattern(w=400, h=400)
     image = np.rint(255 * grid.render()[40:300, 60:340]).astype(np.uint8)
-    (path,) = write_images(tmp_path, [image])
-    found, expected = DECODERS["network"](grid).decode([path]), GridImageDecoder(grid).decode(image)
+    found, expected = DECODERS["network"](grid).decode([image], ["a.png"]), GridImageDecoder(grid).decode(image)
     np.testing.assert_array_equal(found.coords, expected.coords)
     np.testing.assert_array_equal(found.pattern, expected.pattern)
     x, y = np.meshgrid(np.arange(280) + 60.5, np.arange(260) + 40.5)
@@ -101,26 +95,25 @@ def test_the_network_decoder_reads_the_one_image_of_a_frame(tmp_path):
     assert np.isfinite(error).mean() > 0.95 and np.nanmax(error) < 1 and np.nanmedian(error) < 0.1
 
 
-def test_a_stated_order_is_believed_unless_the_images_show_another(tmp_path):
+def test_a_stated_order_is_believed_unless_the_images_show_another():
     """The camera exposes its brightest image less: white is darker than stripes, and no known order fits."""
     coords, layout = exact_coords(), GrayCode.in_order("opencv", LAYOUT.w, LAYOUT.h, LAYOUT.cell)
     images = photographs(coords, layout=layout)
     images[-2] = (0.6 * images[-2]).astype(np.uint8)
-    paths = write_images(tmp_path, images)
     with pytest.raises(
         DecodingError, match=r"not in the order of the sequence.*30\.png \(white\) is not the brightest"
     ):
-        GrayCodeDecoder(layout).decode(paths)
-    decoded = GrayCodeDecoder(layout, order_stated=True).decode(paths)
+        GrayCodeDecoder(layout).decode(images, NAMES)
+    decoded = GrayCodeDecoder(layout, order_stated=True).decode(images, NAMES)
     assert "30.png (white) is not the brightest" in decoded.notes[0] and "in the stated order" in decoded.notes[0]
     both = decoded.decoded & np.isfinite(coords).all(-1)
     assert both.mean() > 0.5 and np.median(np.abs(decoded.coords[both] - coords[both])) < 0.1
-    paths = write_images(tmp_path, photographs(coords, layout=layout))
+    images = photographs(coords, layout=layout)
     for stated in (False, True):
         with pytest.raises(DecodingError, match="in the order of opencv, procam, not of sl-pattern") as caught:
-            GrayCodeDecoder(LAYOUT, stated).decode(paths)
+            GrayCodeDecoder(LAYOUT, stated).decode(images, NAMES)
         assert caught.value.remedy == "give --sequence opencv"
-    mirrored = write_images(tmp_path, [image[:, ::-1] for image in photographs(coords, layout=layout)])
+    mirrored = [image[:, ::-1] for image in images]
     with pytest.raises(DecodingError, match="as in a mirror") as caught:
-        GrayCodeDecoder(layout, order_stated=True).decode(mirrored)
+        GrayCodeDecoder(layout, order_stated=True).decode(mirrored, NAMES)
     assert "from rear to front projection" in caught.value.remedy

@@ -10,6 +10,7 @@ import sl_nerfstudio.decoding
 from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.grid import GridImageDecoder
 from sl_nerfstudio.pattern.grid import GridPattern, projected_light
+from sl_nerfstudio.scan.images import shrunk
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import disturb_image
 from sl_nerfstudio.synthesis.synthesise import make_setup
@@ -68,6 +69,25 @@ def test_light_is_what_the_surface_returns_of_the_projectors(decoder, decoded, t
     assert np.corrcoef(decoded.light[both], expected[both])[0, 1] > 0.9
     dark = both & (image < 220)
     np.testing.assert_allclose(np.median(brighter.light[dark] / decoded.light[dark]), 1, atol=0.03)
+
+
+@pytest.mark.parametrize(("scale", "factor"), [(3.2, 5), (0.9, 1)])
+def test_a_photograph_is_shrunk_as_far_as_its_periods_allow(decoder, scale, factor):
+    """Whatever it is enlarged by, and wherever its grid is first looked for."""
+    shown = np.rint(255 * decoder.pattern.render()[100:700, 50:750]).astype(np.uint8)
+    large = cv2.resize(shown, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    framed = np.pad(large, [(0, max(0, 1300 - side)) for side in large.shape])
+    assert decoder.shrink_factor(framed) == factor
+    found = decoder.decode(shrunk(framed, factor)).coords[: int(600 * scale) // factor, : int(700 * scale) // factor]
+    y, x = np.mgrid[: found.shape[0], : found.shape[1]] + 0.5
+    error = np.linalg.norm(found - (np.stack([x, y], -1) * factor / scale + [50, 100]), axis=-1)
+    assert np.isfinite(error).mean() > 0.9 and np.nanmedian(error) < 0.2
+
+
+def test_what_shows_no_grid_or_is_small_is_not_shrunk(decoder, image):
+    assert decoder.shrink_factor(image) == 1
+    noise = np.random.default_rng(0).integers(0, 255, (1300, 1300)).astype(np.uint8)
+    assert decoder.shrink_factor(noise) is decoder.shrink_factor(np.zeros_like(noise)) is None
 
 
 def test_the_shipped_weights_are_small():

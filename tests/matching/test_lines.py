@@ -8,7 +8,7 @@ import torch
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.lie import exp_se3, inverse, transform
-from sl_nerfstudio.matching.lines import EpipolarLines, enlarged, hypotheses, pixels_a_period, with_offset
+from sl_nerfstudio.matching.lines import EpipolarLines, hypotheses, pixels_a_period, places_on_lines, with_offset
 from tests.matching.scene import PERIOD, across, step_scene
 
 CAMERA = Device(w=40, h=30, fl_x=90.0, fl_y=92.0, cx=19.0, cy=16.0, k1=-0.1, k2=0.02, p1=0.002, p2=-0.001)
@@ -41,6 +41,13 @@ def seen(projector, distance):
     return uv.numpy()
 
 
+def places(lines, w):
+    code, parameters, centre, planes = lines.for_tiles
+    x, y = np.empty(30 * 40, np.float32), np.empty(30 * 40, np.float32)
+    places_on_lines(code, parameters, planes.reshape(5, -1), centre, w, x, y)
+    return x.reshape(30, 40), y.reshape(30, 40)
+
+
 def test_coordinates_and_slopes_are_those_of_the_points_in_space(projector):
     lines, w, step = EpipolarLines.of(CAMERA, projector, T_CAMERA_PROJECTOR), 1 / DISTANCE, 1e-5
     np.testing.assert_allclose(lines.at(w), seen(projector, DISTANCE), rtol=2e-6)
@@ -63,8 +70,7 @@ def test_the_nearest_place_on_a_line_is_found_also_from_beside_it(projector):
 def test_one_distance_for_all_pixels_is_the_same_with_and_without_distortion(projector):
     offset = np.random.default_rng(0).normal(size=(30, 40, 2)).astype(np.float32)
     lines = replace(EpipolarLines.of(CAMERA, projector, T_CAMERA_PROJECTOR), offset=offset)
-    x, y = np.empty((30, 40), np.float32), np.empty((30, 40), np.float32)
-    lines.pixels_at(0.3, x, y)
+    x, y = places(lines, 0.3)
     np.testing.assert_allclose(np.stack([x, y], -1) + 0.5, lines.at(np.full((30, 40), 0.3)), atol=1e-3)
 
 
@@ -73,8 +79,7 @@ def test_what_the_projector_does_not_see_has_no_coordinates():
     turned[:3, :3] = turned[:3, :3] @ np.diag([-1.0, 1.0, -1.0])
     lines = EpipolarLines.of(CAMERA, PROJECTORS["pinhole"], turned)
     assert np.isnan(lines.at(1 / DISTANCE)).all()
-    x, y = np.empty((30, 40), np.float32), np.empty((30, 40), np.float32)
-    lines.pixels_at(0.3, x, y)
+    x, y = places(lines, 0.3)
     assert (x < -1000).all() and (y < -1000).all()
     assert np.isnan(lines.nearest(np.full((30, 40, 2), 100.0, np.float32))).all()
 
@@ -109,23 +114,3 @@ def test_the_size_of_a_period_is_measured(pixels):
     coords[30:50] = np.nan
     assert pixels_a_period(coords, PERIOD) == pytest.approx(pixels, rel=1e-3)
     assert pixels_a_period(np.full_like(coords, np.nan), PERIOD) is None
-
-
-@pytest.mark.parametrize("factor", [1, 2, 3])
-def test_coordinates_are_enlarged_exactly_where_surfaces_are_flat(factor):
-    """Also beside a jump, where what lies beyond must not be mixed in; pixels beyond the last square are unknown."""
-    h, w = 61, 47
-    y, x = np.mgrid[:h, :w] + 0.5
-    fine = np.stack([1.3 * x + 0.2 * y, 0.9 * y - 0.1 * x], -1)
-    fine[:, 24:] += 300.0
-    middle = (slice(0, h // factor * factor), slice(0, w // factor * factor))
-    coarse = fine[middle].reshape(h // factor, factor, w // factor, factor, 2).mean((1, 3)).astype(np.float32)
-    coarse[3, 4] = np.nan
-    out = enlarged(coarse, factor, (h, w), PERIOD)
-    known = np.isfinite(out[..., 0])
-    assert not known[3 * factor : 4 * factor, 4 * factor : 5 * factor].any()
-    assert not known[h // factor * factor :].any() and not known[:, w // factor * factor :].any()
-    split = 24 // factor * factor
-    whole = known.copy()
-    whole[:, split : split + factor] &= 24 % factor == 0  # squares on both sides of the jump
-    np.testing.assert_allclose(out[whole], fine[whole], atol=1e-3)

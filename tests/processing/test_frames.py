@@ -41,7 +41,7 @@ from tests.processing.ramp_scan import LAYOUT, NAMES, RampScan
 class KilledDecoder(RampsDecoder):
     """As if the system had run out of memory."""
 
-    def decode(self, paths):
+    def decode(self, images, names):
         os._exit(9)
 
 
@@ -293,6 +293,7 @@ def test_no_more_processes_are_started_than_there_is_memory_for(monkeypatch, meg
     found = frames.default_processes(int(megapixels * 1e6), gigabytes * 10**9)
     assert found == expected
     assert found == 1 or found * (1.4 + 0.2 * megapixels) + 1 < gigabytes
+    assert frames.default_processes(24_000_000, 32 * 10**9, 6) == 14  # shrunk as they are read
 
 
 def test_what_the_decoder_noted_is_said_once_with_its_frames():

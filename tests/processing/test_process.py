@@ -3,7 +3,7 @@
 import inspect
 import json
 import shutil
-from dataclasses import replace
+from dataclasses import astuple, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +11,7 @@ import pytest
 
 from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.processing import consistency
+from sl_nerfstudio.processing import consistency, inputs
 from sl_nerfstudio.processing import process as stages
 from sl_nerfstudio.processing.captures import find_captures
 from sl_nerfstudio.processing.frames import FrameWorker, clouds_of
@@ -22,8 +22,9 @@ from sl_nerfstudio.processing.scan_poses import find_scan_poses
 from sl_nerfstudio.registration.register import ProjectorChoice, register
 from sl_nerfstudio.registration.result import NoCommonSurface, Registration, UndecidedProjector, parse_known_length
 from sl_nerfstudio.scan import check_scan, read_scan
-from sl_nerfstudio.scan.images import read_image
-from sl_nerfstudio.storage import NewFolder
+from sl_nerfstudio.scan.images import encode_png, read_image
+from sl_nerfstudio.scan.write import device_fields
+from sl_nerfstudio.storage import NewFolder, write_atomic
 from tests.formulas import pose_errors
 from tests.processing.conftest import SHORT, register_ramps
 from tests.processing.ramp_scan import LAYOUT, NAMES
@@ -315,6 +316,47 @@ def test_where_the_order_is_known_nothing_is_repeated(registered, unordered):
     wanted = (0, 0, 0) if unordered else (0, 1, 0)
     assert calls == [(wanted, not unordered)] and chosen == wanted and log == []
     assert found.exclusions == ((DOUBT,) if unordered else ())
+
+
+def test_photographs_that_are_shrunk_give_the_same_scan_at_another_size(ramp_scan, whole, tmp_path, monkeypatch):
+    """Captures three times as large, with what belongs to their pixels: a mask, colours, and two picked places.
+
+    Cameras, maps and images of the scan are those of the captures that they were enlarged from.
+    """
+    factor, large = 3, tmp_path / "large"
+    large.mkdir()
+    for path in (ramp_scan.root / "images").rglob("*.png"):
+        fine = np.pad(read_image(path).repeat(factor, 0).repeat(factor, 1), ((0, 1), (0, 2)))  # fill no whole square
+        write_atomic(large / "images" / path.relative_to(ramp_scan.root / "images"), encode_png(fine))
+    h, w = (factor * ramp_scan.camera.h + 1, factor * ramp_scan.camera.w + 2)
+    mask = np.full((h, w), 255, np.uint8)
+    mask[: 3 * factor] = 0
+    for name in NAMES:
+        write_atomic(large / "masks" / f"{name}.png", encode_png(mask))
+        write_atomic(large / "colours" / f"{name}.png", encode_png(np.dstack([mask // 2] * 3)))
+    camera = replace(ramp_scan.camera.scaled(float(factor)), w=w, h=h)
+    document = {"camera": device_fields(camera, "model"), "projector": device_fields(ramp_scan.projector, "model")}
+    (large / "intrinsics.json").write_text(json.dumps(document))
+    (large / "pattern.json").write_bytes(LAYOUT.encode())
+    scan = read_scan(whole[2] / "s")
+    at = [np.argwhere(np.isfinite(scan.frames[k].read_coords()[..., 0]))[400] for k in (0, 1)]
+    x, y = ([(c + 0.5) * factor for c in rc[::-1]] for rc in at)
+    length = f"distance between frame a 1 ({x[0]}, {x[1]}) and frame a 2 ({y[0]}, {y[1]}) = 50 mm"
+    monkeypatch.setattr(inputs, "shrink_factor", lambda *_: factor)
+    config = replace(ramp_scan, root=large).config(
+        tmp_path / "shrunk", masks=large / "masks", color=large / "colours", known_length=length
+    )
+    result, log = _run(config)
+    small = read_scan(config.output)
+    assert "392 x 391 pixels are read as 130 x 130" in log[1] and "--full-size" in log[1]
+    assert result.captured.shrink == factor
+    assert check_scan(config.output) == [] and small.shrunk_by == factor
+    assert astuple(small.frames[0].camera)[:-1] == pytest.approx(astuple(ramp_scan.camera)[:-1])
+    for one, other in zip(small.frames, scan.frames, strict=True):
+        np.testing.assert_array_equal(one.read_image(), other.read_image())
+        np.testing.assert_array_equal(one.read_coords()[3:], other.read_coords()[3:])
+        assert not one.read_mask()[:3].any() and one.read_color().shape == (130, 130, 3)
+    np.testing.assert_allclose([end.pixel for end in small.scale.bar.ends], [rc[::-1] + 0.5 for rc in at])
 
 
 @pytest.fixture(scope="module")

@@ -277,6 +277,20 @@ def test_a_turned_16_bit_tiff_keeps_its_bits(tmp_path):
         assert photograph_header(tmp_path / name).bits == 16
 
 
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_photograph_is_shrunk_to_means_of_squares_after_it_is_turned(tmp_path, dtype):
+    pixels = SCENE.astype(dtype)[:95, :125] * (1 if dtype == np.uint8 else np.uint16(257))
+    cv2.imwrite(str(tmp_path / "a.png"), pixels[..., ::-1])
+    found = read_photograph(tmp_path / "a.png", 4)
+    mean = pixels[:92, :124].reshape(23, 4, 31, 4, 3).mean((1, 3))
+    assert found.dtype == dtype and found.shape == mean.shape and np.abs(found - mean).max() <= 0.5
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(SCENE[:95, :125]).save(tmp_path / "turned.png", exif=exif)
+    turned_first = np.rot90(SCENE[:95, :125], -1)[:124, :92].reshape(31, 4, 23, 4, 3).mean((1, 3))
+    assert np.abs(read_photograph(tmp_path / "turned.png", 4) - turned_first).max() <= 0.5
+
+
 def test_a_phone_picture_is_read_upright(tmp_path):
     exif = Image.Exif()
     exif[0x0112] = 6

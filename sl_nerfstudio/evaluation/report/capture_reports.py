@@ -235,7 +235,8 @@ def render_processing_report(result: ProcessResult, previews: Sequence[Preview])
         undecided = [f.name for f in result.frames if f.undecided]
         missing = [] if result.config.unordered else unconnected_neighbours(result.frames, result.edges)
         numbers = {f.name: k for k, f in enumerate(result.frames)}
-        view = placed_scene(result.placed, result.units, undecided, missing, numbers)
+        shrink = 1 if result.captured is None else result.captured.shrink
+        view = placed_scene(result.placed, result.units, undecided, missing, numbers, shrink)
     values = {
         "captures": Captures.of(result, rows),
         "sentence": _sentence(result),

@@ -46,7 +46,7 @@ def packed(values: ndarray, kind: str) -> str:
 
 @dataclass(frozen=True)
 class SeenAt:
-    """The pixel of a capture in which each point of a surface was decoded."""
+    """The pixel of a photograph in which each point of a surface was decoded."""
 
     names: Sequence[str]  # of the frames
     frame: Int[ndarray, "v"]  # index into the names; -1: no frame decoded it
@@ -233,7 +233,7 @@ def decoded_at(
         seen = ~surface.occluded(points[left], T[:3, 3])
         left, pixel = left[seen], pixel[seen]
         frame[left], uv[left], best[left] = k, pixel, facing[left]
-    return SeenAt([one.name for one in scan.frames], frame, uv)
+    return SeenAt([one.name for one in scan.frames], frame, uv * scan.shrunk_by)
 
 
 # The points of registered frames, one group of frames at a time.
@@ -249,16 +249,17 @@ def placed_scene(
     undecided: Sequence[str],
     missing: Sequence[tuple[str, str]],
     numbers: dict[str, int],
+    shrink: int = 1,
 ) -> View:
     """View the points and devices of a group of frames, with a choice of the groups.
 
     `undecided` are frames whose poses are not certain; `missing` are pairs between which a frame should be added;
-    `numbers` are the frames' places among all captures.
+    `numbers` are the frames' places among all captures; `shrink` is the size of a pixel in the photographs.
     """
     drawn, still = [], None
     for group in groups:
         cameras = np.array([frame.T_world_camera for frame in group.frames])
-        surface = placed_surface(group, numbers)
+        surface = placed_surface(group, numbers, shrink)
         if still is None:
             view = OrthographicView(*first_direction(cameras, np.median(surface.points, axis=0)))
             still = render_discs(surface.points, surface.normals, surface.radius, view, *STILL)
@@ -270,8 +271,8 @@ def placed_scene(
     return View.of(units, drawn, still)
 
 
-def placed_surface(group: PlacedGroup, numbers: dict[str, int]) -> ShownSurface:
-    """Points of a group's frames as discs, each in the plane of its neighbours; `numbers` as in `placed_scene`."""
+def placed_surface(group: PlacedGroup, numbers: dict[str, int], shrink: int = 1) -> ShownSurface:
+    """Points of a group's frames as discs, each in the plane of its neighbours; the others as in `placed_scene`."""
     step = max(1, -(-sum(len(frame.points) for frame in group.frames) // _MOST_DISCS))
     frames = [replace(f, points=f.points[::step], uv_camera=f.uv_camera[::step]) for f in group.frames]
     points = np.concatenate([frame.points for frame in frames]).astype(np.float64)
@@ -284,7 +285,9 @@ def placed_surface(group: PlacedGroup, numbers: dict[str, int]) -> ShownSurface:
     places = np.array([numbers[frame.name] for frame in frames])
     scale = ColourScale("turbo", float(places.min()), max(float(places.max()), places.min() + 1.0))
     layer = ColourLayer("frames", places[index].astype(np.float64), scale, "number of the frame")
-    return ShownSurface(points, normals, SeenAt([frame.name for frame in frames], index, uv), [layer], radius=radius)
+    return ShownSurface(
+        points, normals, SeenAt([frame.name for frame in frames], index, uv * shrink), [layer], radius=radius
+    )
 
 
 def _discs(points: Float64[ndarray, "n 3"], eyes: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, "n 3"], float]:
