@@ -142,7 +142,7 @@ class SLPipeline(VanillaPipeline):
     - After a checkpoint is loaded for viewing or export, cameras are at their refined poses.
     - The viewer shows the scan (viewer.py), and at the end of training the next commands are printed.
     - On a GPU, kernels compute the losses of a step (kernel_step.py).
-    - Several processes average their gradients without DistributedDataParallel (processes.py).
+    - Several processes average their gradients without DistributedDataParallel (loop.py).
     """
 
     config: SLPipelineConfig
