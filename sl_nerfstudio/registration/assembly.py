@@ -27,6 +27,7 @@ from sl_nerfstudio.registration.pose_graph import Component, Pivots, optimise_at
 
 MOST_COMPARED = 12  # clearly different similarities between two components
 MOST_PAIRS = 10  # of frames across two components that are compared
+MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
 LEAST_SIGHT_COSINE = float(np.cos(np.radians(75.0)))  # between lines of sight: beyond it frames share no surface
 
 
@@ -129,14 +130,16 @@ class Assembly:
         places = self._proposed(first, second)
         if not places:
             return None
-        found = self.compare(first, second, places, self._known_alike(first, second, places))
-        usual = np.array([self.usual(first, second, S) for S in places])
+        nodes = [self.settled(first, second, S) for S in places]
+        found = self.compare(first, second, nodes, self._known_alike(first, second, places))
+        usual = np.array([self.usual(first, second, at) for at in nodes])
         both = found.leads + usual[:, None] - usual
         best = int(np.argmax(both.min(1)))
         if found.odds[best] < LEAST_ODDS:
             return None
-        others = [k for k in range(len(places)) if k != best]
-        return Decision(places[best], float(min(both[best, others], default=found.odds[best])))
+        others = [k for k, at in enumerate(nodes) if k != best and self.differ(first, second, nodes[best], at)]
+        S = self._between_worlds(first, second, nodes[best])
+        return Decision(S, float(min(both[best, others], default=found.odds[best])))
 
     def _proposed(self, first: Component, second: Component) -> list[Similarity]:
         """The clearly different similarities between two components that pairs across say, the most likely first."""
@@ -145,43 +148,86 @@ class Assembly:
         for link in sorted(links, key=lambda one: -one.log_odds):
             if len(distinct) == MOST_COMPARED:
                 break
-            if all(self.differ(link.S_first_second, other, second) for other in distinct):
+            if all(self._differ(link.S_first_second, other, second) for other in distinct):
                 distinct.append(link.S_first_second)
         return distinct
 
+    def settled(self, first: Component, second: Component, S_first_second: Similarity) -> Component:
+        """Put two components together and let their frames move to where the pairs want them that know their places.
+
+        Components have errors of scale that add up around an object: rigid ones would not fit on both of their ends.
+        """
+        both = {**first, **{k: S_first_second @ S for k, S in second.items()}}
+        known = [
+            e for e in self._between(first, second) if e.log_odds_at(relative(both, e.source, e.target)) is not None
+        ]
+        inside = [e for part in (first, second) for e in self.edges if e.source in part and e.target in part]
+        return optimise_at_places([*inside, *known], self.pivots, both).S_world_camera
+
+    @staticmethod
+    def _between_worlds(first: Component, second: Component, both: Component) -> Similarity:
+        """The similarity between two components whose frames are at given nodes."""
+        i, j = next(iter(first)), next(iter(second))
+        return first[i] @ relative(both, j, i) @ second[j].inverse()
+
     def compare(
-        self, first: Component, second: Component, places: Sequence[Similarity],
+        self, first: Component, second: Component, nodes: Sequence[Component],
         alike: Bool[ndarray, "k k"] | bool = False,
     ) -> Comparison:  # fmt: skip
-        """Compare places by all frames that face each other there.
+        """Compare places of two components by all of their frames that face each other there.
 
         The errors of a frame are the same in all of its pairs. Where each frame has d pairs across, they count as
-        2 / (d + d') of independent ones. `alike`: at which places the surface is known to look the same (all of
-        them, if True); frames that face each other at two of them show it as well.
+        2 / (d + d') of independent ones. `nodes`: all frames at each place. `alike`: at which places the surface is
+        known to look the same (all of them, if True); frames that face each other at two of them show it as well.
         """
-        found = Comparison.none(len(places))
-        near = [set(facing(first, second, S)) for S in places]
+        found = Comparison.none(len(nodes))
+        near = [set(facing({i: at[i] for i in first}, {j: at[j] for j in second})) for at in nodes]
         counts = [Counter(k for pair in pairs for k in pair) for pairs in near]
         degree = {k: max(count[k] for count in counts) for k in set().union(*counts)}
         for i, j in sorted(set().union(*near)):
-            here = [
-                first[i].inverse() @ S @ second[j] if see_same_side(first[i], S @ second[j]) else None for S in places
-            ]
+            here = [relative(at, j, i) if see_same_side(at[i], at[j]) else None for at in nodes]
             found += self._scan.comparison(j, i, here).scaled(2 / (degree[i] + degree[j]))
-        found += self._by_tone(first, second, places)
+        found += self._by_tone(first, second, nodes)
         return replace(found, alike=found.alike | alike)
 
-    def _by_tone(self, first: Component, second: Component, places: Sequence[Similarity]) -> Comparison:
+    def _by_tone(self, first: Component, second: Component, nodes: Sequence[Component]) -> Comparison:
         """What the tones of frames across say, which hold them where surfaces would slip."""
         across = [e for e in self._between(first, second) if e.by_tone]
         degree = Counter(k for e in across for k in (e.source, e.target))
-        odds = np.zeros(len(places))
+        odds = np.zeros(len(nodes))
         for e in across:
-            for k, S in enumerate(places):
-                both = {**first, **{j: S @ one for j, one in second.items() if j in (e.source, e.target)}}
-                if e.log_odds_at(both[e.target].inverse() @ both[e.source]) is not None:
+            for k, at in enumerate(nodes):
+                if e.log_odds_at(relative(at, e.source, e.target)) is not None:
                     odds[k] += TONE_ODDS * 2 / (degree[e.source] + degree[e.target])
-        return replace(Comparison.none(len(places)), shared=odds[:, None] - odds, odds=odds)
+        return replace(Comparison.none(len(nodes)), shared=odds[:, None] - odds, odds=odds)
+
+    def looks_alike(self, nodes: Component, turn: Similarity) -> bool:
+        """Whether the surface looks the same after a turn of the world, as a box does.
+
+        Some registered pair has to say so. Then those frames decide that face each other best both before one of them
+        is moved and after it: whether they agree at both places, or one of these contradicts.
+        """
+        if not any(self._fits_as_well(e, nodes, T) for e in self.edges for T in (turn, turn.inverse())):
+            return False
+        said = 0.0
+        for i, j in facing_after(nodes, turn):
+            here = relative(nodes, j, i)
+            found = self._scan.comparison(j, i, [here, nodes[i].inverse() @ turn @ nodes[j]])
+            if found.alike[0, 1]:
+                said += LEAST_ODDS
+            else:
+                contradicted = replace(found, alike=np.ones((2, 2), dtype=bool)).leads[0, 1]
+                said -= min(abs(float(contradicted)), MOST_AGAINST)
+        return said > 0
+
+    @staticmethod
+    def _fits_as_well(e: PairMatch, nodes: Component, turn: Similarity) -> bool:
+        """Whether a pair fits as well after its source is moved by a turn of the world."""
+        if not e.rivals or e.source not in nodes or e.target not in nodes:
+            return False
+        back = nodes[e.target].inverse()
+        here, there = e.log_odds_at(back @ nodes[e.source]), e.log_odds_at(back @ turn @ nodes[e.source])
+        return here is not None and there is not None and abs(here - there) < LEAST_ODDS
 
     def _known_alike(self, first: Component, second: Component, places: Sequence[Similarity]) -> Bool[ndarray, "k k"]:
         """Between which places the frames of one of the components are known to look the same."""
@@ -189,14 +235,18 @@ class Assembly:
         for k, S in enumerate(places):
             for m, other in enumerate(places[:k]):
                 turns = ((first, S @ other.inverse()), (second, S.inverse() @ other))
-                out[k, m] = out[m, k] = any(looks_alike(self.edges, part, turn) for part, turn in turns)
+                out[k, m] = out[m, k] = any(self.looks_alike(part, turn) for part, turn in turns)
         return out
 
-    def usual(self, first: Component, second: Component, S: Similarity) -> float:
-        """Log-odds of a place by the order of capture."""
+    def differ(self, first: Component, second: Component, a: Component, b: Component) -> bool:
+        """Whether two components are at clearly different places, to each other, in two worlds."""
+        return self._differ(*(self._between_worlds(first, second, at) for at in (a, b)), second)
+
+    def usual(self, first: Component, second: Component, nodes: Component) -> float:
+        """Log-odds of a place of two components by the order of capture."""
         if self.prior is None:
             return 0.0
-        return sum(self.prior(i, j, first[i].inverse() @ S @ second[j]) for i in first for j in second)
+        return sum(self.prior(i, j, relative(nodes, j, i)) for i in first for j in second)
 
     def _between(self, first: Component, second: Component) -> list[PairMatch]:
         return [
@@ -215,7 +265,7 @@ class Assembly:
             Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), odds) for S, odds in places
         ]
 
-    def differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
+    def _differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
         """Whether two similarities put the frames of `second` at clearly different places."""
         if angle_deg(a.R @ b.R.T) > SAME_PLACE_DEG:
             return True
@@ -226,29 +276,30 @@ class Assembly:
         return bool(min(shifts) > SAME_PLACE_SHIFT)
 
 
-def looks_alike(edges: Sequence[PairMatch], nodes: Component, turn: Similarity) -> bool:
-    """Whether a pair of frames fits as well after one of them is moved by a turn of their world: as on a box."""
-    inverse = turn.inverse()
-    for e in edges:
-        if e.rivals and e.source in nodes and e.target in nodes:
-            back = nodes[e.target].inverse()
-            here = e.log_odds_at(back @ nodes[e.source])
-            for T in (turn, inverse):
-                there = e.log_odds_at(back @ T @ nodes[e.source])
-                if here is not None and there is not None and abs(here - there) < LEAST_ODDS:
-                    return True
-    return False
+def relative(nodes: Component, source: int, target: int) -> Similarity:
+    """The similarity from one frame to another."""
+    return nodes[target].inverse() @ nodes[source]
 
 
-def facing(first: Component, second: Component, S: Similarity, most: int = MOST_PAIRS) -> list[tuple[int, int]]:
-    """The pairs of frames across two components whose cameras look most nearly the same way."""
+def facing(first: Component, second: Component, most: int = MOST_PAIRS) -> list[tuple[int, int]]:
+    """The pairs of frames of two components in one world whose cameras look most nearly the same way."""
     here, there = list(first), list(second)
     if not here or not there:
         return []
-    sight = np.array([first[i].R[:, 2] for i in here]), np.array([(S.R @ second[j].R)[:, 2] for j in there])
+    sight = np.array([first[i].R[:, 2] for i in here]), np.array([second[j].R[:, 2] for j in there])
     cosine = (sight[0][:, None] * sight[1]).sum(-1).ravel()
     near = np.argsort(-cosine, kind="stable")[:most]
     return [(here[k // len(there)], there[k % len(there)]) for k in near if cosine[k] > LEAST_SIGHT_COSINE]
+
+
+def facing_after(nodes: Component, turn: Similarity, most: int = MOST_PAIRS) -> list[tuple[int, int]]:
+    """The pairs of frames that face each other best both as they are and after the second is moved by a turn."""
+    frames, sight = np.array(list(nodes)), np.array([S.R[:, 2] for S in nodes.values()])
+    cosine = np.minimum(sight @ sight.T, sight @ turn.R @ sight.T)
+    np.fill_diagonal(cosine, -1)
+    near = np.argsort(-cosine, axis=None, kind="stable")[:most]
+    first, second = np.unravel_index(near[cosine.flat[near] > LEAST_SIGHT_COSINE], cosine.shape)
+    return list(zip(frames[first].tolist(), frames[second].tolist(), strict=True))
 
 
 def see_same_side(a: Similarity, b: Similarity) -> bool:

@@ -15,14 +15,13 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import Assembly, looks_alike
+from sl_nerfstudio.registration.assembly import MOST_AGAINST, Assembly
 from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_TURN_DEG, TONE_ODDS, PairMatch
 from sl_nerfstudio.registration.pose_graph import Component, optimise_at_places
 
 MOST_TURNS = 48  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
 LEAST_GAIN = 1.0  # nats by which a block must fit better elsewhere to be moved
-MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
 LEAST_SIDE_DEG = 20.0  # between two sides of an object
 STARTS = 24  # frames from which a block is grown
 
@@ -129,14 +128,17 @@ class BlockReview:
         return set(np.array(list(self.nodes))[block].tolist())
 
     def _verified(self, cut: Cut, inside: Bool[ndarray, "n"] | None = None, with_order: bool = True) -> float:
-        """What a turn gains by all frames that face each other across the border, before it or after it."""
+        """What a turn gains, in nats, by all frames that face each other across the border, before it or after it."""
         moved = self._frames(cut.block)
         kept = self._frames(~cut.block if inside is None else inside & ~cut.block)
         first, second = ({k: self.nodes[k] for k in sorted(part)} for part in (kept, moved))
-        places = [Similarity.identity(), cut.turn.S_world_world]
-        gain = float(self._assembly.compare(first, second, places, cut.turn.alike).leads[1, 0])
+        places = (Similarity.identity(), cut.turn.S_world_world)
+        nodes = [self._assembly.settled(first, second, S) for S in places]
+        if not self._assembly.differ(first, second, *nodes):
+            return -np.inf  # its frames move back
+        gain = float(self._assembly.compare(first, second, nodes, cut.turn.alike).leads[1, 0])
         if with_order:
-            gain += self._assembly.usual(first, second, places[1]) - self._assembly.usual(first, second, places[0])
+            gain += self._assembly.usual(first, second, nodes[1]) - self._assembly.usual(first, second, nodes[0])
         return gain
 
     def _turns(self) -> list[Turn]:
@@ -160,7 +162,7 @@ class BlockReview:
     ) -> Turn:  # fmt: skip
         surface, order = np.zeros((2, len(column), len(column)))
         inverse = turn.inverse()
-        alike = looks_alike(self._edges, self.nodes, turn)
+        alike = self._assembly.looks_alike(self.nodes, turn)
         for e, S, here in pairs:
             i, j = column[e.source], column[e.target]
             weight = 2 / (self._degree[e.source] + self._degree[e.target])  # see Assembly.compare

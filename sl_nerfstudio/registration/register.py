@@ -181,10 +181,7 @@ def _support_of(k: int, solution: PoseGraphSolution, scan: ScanEvidence) -> tupl
     if k not in nodes:
         return 0.0, 0.0
     others = {j: S for j, S in nodes.items() if j != k}
-    found = [
-        scan.agreement(i, j, nodes[j].inverse() @ nodes[i])
-        for i, j in facing({k: nodes[k]}, others, Similarity.identity(), FACING)
-    ]
+    found = [scan.agreement(i, j, nodes[j].inverse() @ nodes[i]) for i, j in facing({k: nodes[k]}, others, FACING)]
     odds, agreeing, expected = (math.fsum(each) for each in zip(*found, strict=True)) if found else (0.0, 0.0, 0.0)
     return odds, agreeing / expected if expected else 0.0
 

@@ -124,7 +124,8 @@ def test_frames_that_agree_across_two_sides_that_look_the_same_say_nothing(frame
     """Where a turn is known to show the same, frames that face each other after it do not lead for that."""
     assembly, half = assembly_of(frames, right(FIRST)), turned(Similarity.identity(), 180, np.zeros(3))
     first, second = {0: TRUE[0]}, {1: TRUE[1]}
-    leads = assembly.compare(first, second, [Similarity.identity(), half], alike=known).leads
+    nodes = [assembly.settled(first, second, S) for S in (Similarity.identity(), half)]
+    leads = assembly.compare(first, second, nodes, alike=known).leads
     assert (leads[0, 1] > 5 * LEAST_ODDS) is not known
     assert abs(leads[0, 1]) < 1e-9 or not known
 
@@ -152,3 +153,12 @@ def test_the_result_does_not_depend_on_the_order_of_the_edges(frames, random):
         for k in a:
             relative = [(c[first].inverse() @ c[k]).matrix() for c in (a, b)]
             np.testing.assert_allclose(relative[0], relative[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("odd", [0.0, 0.35], ids=["the same", "another"])
+def test_an_object_looks_alike_after_a_turn_if_its_frames_say_so_and_not_for_what_a_pair_says(odd):
+    same, half = Similarity.identity(), Similarity(1.0, rolled(180), np.zeros(3))
+    frames = [frame_evidence(cloud_of_depth(lambda x, y: relief(x, y, odd)))] * 2
+    for known, alike in ((half, odd == 0), (Similarity(1.0, rolled(90), np.zeros(3)), False)):
+        assembly = assembly_of(frames, [edge([same, same], 0, 1, rivals=(Rival(known, 0.0),))])
+        assert assembly.looks_alike({0: same, 1: same}, half) is alike

@@ -41,14 +41,16 @@ def test_a_nut_is_registered_at_the_sides_that_it_shows_or_said_to_be_symmetric(
 
 
 @pytest.mark.slow
-def test_no_frame_of_a_bar_is_on_the_wrong_side(tmp_path: Path) -> None:
-    """Two bosses, one on each end, of unequal height: it is nearly the same after half a turn."""
+def test_a_bar_is_registered_all_around(tmp_path: Path) -> None:
+    """Two bosses, one on each end, of unequal height: it is nearly the same after half a turn.
+
+    In steps of 45 degrees errors of scale add up around it: rigid parts would not meet.
+    """
     write_bar(tmp_path / "bar.ply")
     true = rendered(str(tmp_path / "bar.ply"), tuple(range(FRAMES)), FRAMES, 90)
     found = register(true.clouds)
-    left_out = {e.frame for e in found.exclusions}  # in steps of 45 degrees hardly any surface is seen twice
-    assert left_out == {name for name, inside in zip(found.names, found.registered, strict=True) if not inside}
-    assert not found.registered.any() or max(turned_from_truth(found, true)) < 3
+    assert found.registered.all() and not found.turns_deg
+    assert max(turned_from_truth(found, true)) < 0.5
 
 
 @pytest.mark.slow
