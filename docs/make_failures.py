@@ -126,7 +126,7 @@ def process(folder: Path) -> None:
     ended = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     report = next(folder.glob("scan*/processing.json"), None)
     frames = [] if report is None else json.loads(report.read_text())["frames"]
-    reasons = [f"\n{frame['name']}: {frame['reason']}" for frame in frames if frame["reason"]]
+    reasons = [f"\n{frame['name']}: {frame['reason']}" for frame in frames if frame.get("reason")]
     (folder / "said.txt").write_text("".join([ended.stdout, ended.stderr if ended.returncode else "", *reasons]))
     print(f"{folder / 'said.txt'}: status {ended.returncode}")
 
