@@ -139,7 +139,7 @@ def viewer(demo: Path) -> None:
 
 
 def preview(demo: Path) -> None:
-    """`sl-scan --preview` after the adjustment, and in the training, from the photographs of the demo."""
+    """`sl-scan --preview` after the adjustment, from the photographs of the demo."""
     captures = demo / "captures"
     with tempfile.TemporaryDirectory() as folder:
         files = (
@@ -154,10 +154,9 @@ def preview(demo: Path) -> None:
             address = "http://127.0.0.1:7007"
             tried(lambda: urlopen(address).read())
             with browser(address, PAGE) as page:
-                for text, name in (("adjusted together", "preview-frames"), ("training, step", "preview-surface")):
-                    page.wait(text)
-                    time.sleep(8)
-                    page.save(f"{name}.png")
+                page.wait("adjusted together")
+                time.sleep(8)
+                page.save("preview.png")
 
 
 WINDOWS = {"reports": reports, "viewer": viewer, "preview": preview}

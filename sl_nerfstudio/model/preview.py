@@ -46,8 +46,9 @@ _MOST_OF_A_FRAME = 4_000
 _OUTSIDE = 2.0  # percent of the points beyond each side of the box that is looked at
 _FARTHEST = 1.5  # from the middle of the scene, in half the diagonal of that box: points beyond are decoding errors
 _POINT_SIZE = 0.004
-_RESOLUTION = 96  # cells along the scene's box
-_TRAINING_PER_DRAWING = 30  # seconds of training for each second that the surface takes
+_RESOLUTION = 80  # cells along the scene's box
+_TRAINING_PER_DRAWING = 20  # seconds of training for each second that the surface takes
+_FIRST_SECONDS = 0.2  # counted for the frames, which are drawn once
 
 
 @dataclass(frozen=True)
@@ -113,9 +114,12 @@ class Preview:
         begun = time.monotonic()
         if begun < self._due or not self._server.get_clients():
             return
-        if not self._training:
+        if not self._training:  # there is no surface yet, but a sphere
             self._training = True
             self._draw_scan(model)
+            self.say(f"training, step {model.step}")
+            self._due = time.monotonic() + _TRAINING_PER_DRAWING * _FIRST_SECONDS
+            return
         self._draw_surface(model)
         self._due = time.monotonic() + _TRAINING_PER_DRAWING * (time.monotonic() - begun)
 
