@@ -19,7 +19,8 @@ from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
 
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 ROOT = Path(__file__).parents[1]
 PICTURES = ROOT / "docs" / "pictures"
@@ -32,7 +33,7 @@ LONGEST = 600.0  # seconds to wait for something on a page
 class Page:
     """A page in Chromium."""
 
-    def __init__(self, connection: ClientConnection) -> None:
+    def __init__(self, connection: Connection) -> None:
         self._connection, self._numbers = connection, count(1)
 
     def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
