@@ -70,7 +70,7 @@ class Preview:
         with redirect_stdout(io.StringIO()):  # viser prints its address, in a frame
             self._server = viser.ViserServer(HOST, port, verbose=False)
         found = self._server.get_port()
-        address = f"http://{HOST}:{found} (open it in a browser; the page ends with this command)"
+        address = f"{HOST}:{found} (open it in a browser; the page ends with this command)"
         self.where = address if found == PORT else f"{address}; port {PORT} is in use by another program"
         self._devices: Float64[ndarray, "n 4 4"] | None = None
         self._surface: Float64[ndarray, "v 3"] | None = None

@@ -221,7 +221,7 @@ def test_a_preview_shows_frames_and_surface_ends_with_the_command_and_changes_no
         said = succeed(main, "sl-scan", *words(captures, output, "--preview")).words
     (browser,) = browsers
     assert browser.port > port
-    assert f"http://127.0.0.1:{browser.port} (open it" in said and f"port {port} is in use by another program" in said
+    assert f" 127.0.0.1:{browser.port} (open it" in said and f"port {port} is in use by another program" in said
     browser.join(10)
     assert not browser.is_alive()
     with pytest.raises(OSError):
