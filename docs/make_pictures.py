@@ -3,14 +3,13 @@
 .venv/bin/python docs/make_pictures.py architecture           # docs/pictures/architecture.png, from the code's imports
 .venv/bin/python docs/make_pictures.py demo [outputs/demo]    # docs/pictures/demo.png, from the output of `make demo`
 .venv/bin/python docs/make_pictures.py capture [captures]       # docs/pictures/capture.png, from sl-synth --images-only
-.venv/bin/python docs/make_pictures.py reports [outputs/demo-images]    # of both reports, by Chromium
+
+Those of windows: docs/make_windows.py; of photographs with mistakes: docs/make_failures.py.
 """
 
 import ast
 import json
 import re
-import shutil
-import subprocess
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -64,23 +63,6 @@ def draw_capture(captures: Path) -> None:
     lines = view_lines(view, selection.judge(view, 0.0), selection)
     picture = compose(picture_of(images[4], view), [draw_map(selection.times_seen)], lines)
     cv2.imwrite(str(PICTURES / "capture.png"), picture[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 9])
-
-
-# ------------------------------------------------------------------ the reports
-
-
-def draw_reports(demo: Path) -> None:
-    """The tops of both reports, as a browser shows them."""
-    browser = next((found for name in ("chromium", "google-chrome", "chrome") if (found := shutil.which(name))), None)
-    if browser is None:
-        raise SystemExit("Chromium or Chrome is needed, which draws the pages")
-    for page, name in ((demo / "scan/processing.html", "processing-report"), (demo / "report.html", "scan-report")):
-        software = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # draws WebGL without a GPU
-        run = (browser, "--headless=new", "--no-sandbox", "--hide-scrollbars", *software, "--virtual-time-budget=15000")
-        picture = PICTURES / f"{name}.png"
-        size = ("--window-size=1160,1000", f"--screenshot={picture}", page.resolve().as_uri())
-        subprocess.run([*run, *size], check=True, stderr=subprocess.DEVNULL)
-        print(f"{picture}: {picture.stat().st_size // 1000} kB")
 
 
 # ------------------------------------------------------------------ the demo
@@ -271,8 +253,6 @@ def main(arguments: Sequence[str]) -> None:
         draw_architecture()
     elif arguments[:1] == ["capture"]:
         draw_capture(Path(arguments[1] if len(arguments) > 1 else "outputs/demo-images/captures"))
-    elif arguments[:1] == ["reports"]:
-        draw_reports(Path(arguments[1] if len(arguments) > 1 else "outputs/demo-images"))
     elif arguments[:1] == ["demo"]:
         draw_demo(Path(arguments[1] if len(arguments) > 1 else "outputs/demo"))
     else:

@@ -1,5 +1,6 @@
 """Every command, flag, setting, file, link and picture in the documentation exists."""
 
+import ast
 import dataclasses
 import importlib
 import os
@@ -162,6 +163,21 @@ def test_pictures_are_small_and_used():
     for picture in pictures:
         assert picture.stat().st_size < MOST_BYTES_OF_A_PICTURE, picture
         assert picture in used, f"{picture} is shown nowhere"
+
+
+def test_common_failures_are_quoted_as_the_code_says_them():
+    """Sentences are put together of strings, numbers and names, so runs of three words between these are compared."""
+    nodes = (node for path in (ROOT / "sl_nerfstudio").rglob("*.py") for node in ast.walk(ast.parse(path.read_text())))
+    strings = [node.value for node in nodes if isinstance(node, ast.Constant) and type(node.value) is str]
+    said = {run for text in strings for run in threes(text)}
+    for line in re.findall(r"^    +(.*)$", (ROOT / "docs" / "failures.md").read_text(), re.MULTILINE):
+        runs = [run for part in re.split(r"[\d:;,]|frame_\S+|captures/\S+", line) for run in threes(part)]
+        assert 4 * sum(run in said for run in runs) >= 3 * len(runs), line
+
+
+def threes(text: str) -> list[tuple[str, ...]]:
+    words = re.findall(r"[a-z-]+", text.lower())
+    return list(zip(words, words[1:], words[2:], strict=False))
 
 
 def test_readme_shows_every_command():

@@ -8,6 +8,7 @@ from sl_nerfstudio.console import command, next_steps, phase, say
 from sl_nerfstudio.processing.config import ProcessConfig
 
 if TYPE_CHECKING:
+    from sl_nerfstudio.processing.process import Watch
     from sl_nerfstudio.processing.result import ProcessResult
 
 
@@ -45,14 +46,14 @@ def _process() -> None:
     )
 
 
-def process_photographs(config: ProcessConfig) -> "ProcessResult":
-    """Make the scan folder with its report. Raises UserError for anything a user can correct."""
+def process_photographs(config: ProcessConfig, watch: "Watch | None" = None) -> "ProcessResult":
+    """Make the scan folder with its report; for `watch` see `process`. Raises UserError for what a user can correct."""
     config.check()
     with phase("start"):
         from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
         from sl_nerfstudio.processing.process import process
 
-    return process(config, render_processing_report, say)
+    return process(config, render_processing_report, say, watch)
 
 
 def findings(result: "ProcessResult", what: str = "") -> str:

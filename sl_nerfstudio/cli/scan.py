@@ -7,7 +7,7 @@ import shlex
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import MISSING, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,10 +17,11 @@ import tyro
 
 from sl_nerfstudio.cli.arguments import flag_name, parse
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.console import command, duration, next_steps, phase, say, short_path
+from sl_nerfstudio.console import command, duration, next_steps, paragraph, phase, say, short_path
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
+    from sl_nerfstudio.model.preview import Preview
     from sl_nerfstudio.processing.config import ProcessConfig
     from sl_nerfstudio.scan import Scan
 
@@ -57,6 +58,8 @@ class ScanConfig:
     """decode every pixel of the photographs; otherwise large ones are shrunk as they are read"""
     quality: Literal["draft", "normal", "fine"] = "normal"
     """draft: a fifth of the training and coarse cells; fine: three times the training and finer cells"""
+    preview: bool = False
+    """show in a browser what has been found so far: cameras, projectors and points, then the surface as it trains"""
 
     @property
     def is_scan(self) -> bool:
@@ -65,10 +68,11 @@ class ScanConfig:
 
     @property
     def words(self) -> list[str]:
-        """The words of this command, to copy."""
+        """The words of this command, to copy and for the record; without `--preview`, on which no result depends."""
         found = ["sl-scan", str(self.photographs)]
-        for field in fields(self)[1:]:
-            value = getattr(self, field.name)
+        plain = replace(self, preview=False)
+        for field in fields(plain)[1:]:
+            value = getattr(plain, field.name)
             if field.default is MISSING or value != field.default:
                 found += [flag_name(field.name), *([] if value is True else [str(value)])]
         return found
@@ -126,6 +130,7 @@ _INPUTS = {
 _GROUPS = {
     "photographs": ("pattern", "intrinsics", "known_length", "masks", "color", "full_size"),
     "the scan": ("rig", "object_only", "quality"),
+    "this run": ("preview",),
 }
 _STEPS = {"draft": 200, "normal": 1000, "fine": 3000}  # of the training
 _CELLS = {"draft": 256, "normal": 512, "fine": 768}  # along each side of the scene's box
@@ -222,6 +227,13 @@ def _state_of(path: Path | None) -> list[tuple[str, int, int]]:
 
 # The stages. Each calls what its own command calls, and imports it when it is its turn.
 
+_DOING = {  # as the preview says it
+    "process": "reading, decoding and registering the photographs",
+    "train": "preparing the training",
+    "export": "exporting mesh and poses",
+    "evaluate": "judging them",
+}
+
 
 @dataclass(frozen=True)
 class Work:
@@ -229,11 +241,18 @@ class Work:
 
     config: ScanConfig
     done: Progress
+    preview: "Preview | None" = None
 
     @property
     def scan_root(self) -> Path:
         """The scan folder: the given one, or that made of the photographs."""
         return Path(os.path.abspath(self.config.photographs if self.config.is_scan else self.config.output / "scan"))
+
+    def begin(self, stage: str) -> None:
+        """Say that a stage is no longer as it was, and is made."""
+        say(f"-- {stage} --")
+        if self.preview is not None:
+            self.preview.say(_DOING[stage])
 
     def process(self) -> None:
         """Make the scan folder, unless it was made of the same photographs with the same flags."""
@@ -242,11 +261,12 @@ class Work:
         key = _key(replace(config, output=Path()), [_state_of(path) for path in paths])
         if self.done.is_done("process", key, ("scan/transforms.json",)):
             return say(_kept("process", config.output))
-        say(_heading("process"))
+        self.begin("process")
         from sl_nerfstudio.cli.process import findings, process_photographs
 
         with self.done.making("process", key):
-            print(findings(process_photographs(config), " on the photographs"))
+            result = process_photographs(config, self.preview and self.preview.registered)
+            print(findings(result, " on the photographs"))
 
     @cached_property
     def scan(self) -> "Scan":
@@ -291,8 +311,8 @@ class Work:
             if complete:
                 say(_kept("train", path.parent))
             else:
-                say(_heading("train"))
-                train_within(shlex.join(self.config.words), config)
+                self.begin("train")
+                train_within(shlex.join(self.config.words), config, self.preview and self.preview.trained)
             self.done.stages["run"] = digest
         return path
 
@@ -303,7 +323,7 @@ class Work:
         if self.done.is_done("export", key, _RESULTS[:3]):
             say(_kept("export", self.config.output / "mesh.ply"))
             return key
-        say(_heading("export"))
+        self.begin("export")
         from sl_nerfstudio.cli.export import ExportConfig, description, export_trained
         from sl_nerfstudio.cli.run import load_run
         from sl_nerfstudio.meshing.files import write_mesh
@@ -330,16 +350,12 @@ class Work:
             say(_kept("evaluate", root / "report.html"))
             verdict = json.loads((root / "evaluation.json").read_bytes())
             return print("\n".join([f"verdict: {verdict['verdict']}", *(f"  {why}" for why in verdict["reasons"])]))
-        say(_heading("evaluate"))
+        self.begin("evaluate")
         from sl_nerfstudio.cli.evaluate import EvalConfig, evaluate_scan
 
         mesh, poses, json_path, report = (root / name for name in ("mesh.ply", _RESULTS[2], *_JUDGED))
         with self.done.making("evaluate", key, _JUDGED):
             evaluate_scan(EvalConfig(mesh, self.scan_root, poses, json=json_path, report=report))
-
-
-def _heading(stage: str) -> str:
-    return f"-- {stage} --"
 
 
 def _kept(stage: str, where: Path) -> str:
@@ -354,13 +370,23 @@ def scan_photographs(config: ScanConfig) -> None:
     from sl_nerfstudio.storage import locked
 
     begun = time.monotonic()
-    with locked(config.output):
-        work = Work(config, Progress(config.output))
+    with locked(config.output), ExitStack() as stack:
+        done = Progress(config.output)
+        work = Work(config, done, stack.enter_context(_opened_preview(config)) if config.preview else None)
         if not config.is_scan:
             work.process()
         run_config = work.train()
         work.evaluate(work.export(run_config))
     print(_closing(config, run_config, work.scan, time.monotonic() - begun))
+
+
+def _opened_preview(config: ScanConfig) -> "Preview":
+    with phase("start"):
+        from sl_nerfstudio.model.preview import Preview
+
+    preview = Preview(config.photographs.name)
+    print(paragraph("preview", preview.where), flush=True)
+    return preview
 
 
 def _closing(config: ScanConfig, run_config: Path, scan: "Scan", seconds: float) -> str:

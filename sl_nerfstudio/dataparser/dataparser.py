@@ -27,7 +27,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.geometry.numerics import evenly_spaced
-from sl_nerfstudio.geometry.triangulation import triangulate
+from sl_nerfstudio.geometry.triangulation import triangulate, upright
 from sl_nerfstudio.late_imports import begin_imports
 from sl_nerfstudio.parallel import read_at_random, read_in_order
 from sl_nerfstudio.scan import FileError, Frame, Scan, read_scan
@@ -336,7 +336,6 @@ _POINTS_PER_FRAME = 1000
 _FEWEST_POINTS = 16
 _NEIGHBOURS = 8
 _LONELY = 4.0  # times the median distance to the neighbours: beyond it a decoding counts as wrong
-_COMMON_UP = 0.3  # smallest length of the cameras' mean up direction with which it counts as a common one
 _INSIDE = 0.99  # share of the points inside the object's sphere
 
 
@@ -357,22 +356,6 @@ def normalisation(scan: Scan, samples: PixelSamples) -> Similarity:
     scale = OBJECT_RADIUS / radius
     R = upright(scan.poses.T_world_camera)
     return Similarity(scale, R, -scale * R @ centre)
-
-
-def upright(T_world_camera: Float[ndarray, "n 4 4"]) -> Float[ndarray, "3 3"]:
-    """Rotation from world to scene axes: z is the cameras' mean up, x as close as possible to the first camera's right.
-
-    If the cameras roll so much that they have no common up, z is the first camera's up.
-    """
-    up = T_world_camera[:, :3, 1].mean(0)
-    if np.linalg.norm(up) < _COMMON_UP:
-        up = T_world_camera[0, :3, 1]
-    z = up / np.linalg.norm(up)
-    # right and back of the first camera are perpendicular: they cannot both be parallel to z
-    across = [axis - (axis @ z) * z for axis in T_world_camera[0, :3, [0, 2]]]
-    right, back = (np.linalg.norm(axis) for axis in across)
-    x = across[0] / right if right > 0.1 else np.cross(z, across[1] / back)
-    return np.stack([x, np.cross(z, x), z])
 
 
 def triangulated_points(scan: Scan, samples: PixelSamples) -> tuple[Float[ndarray, "n 3"], int]:

@@ -185,6 +185,25 @@ def far_enough(
     return Viewpoint(centre + distance * direction, centre, up)
 
 
+_COMMON_UP = 0.3  # smallest length of the cameras' mean up direction with which it counts as a common one
+
+
+def upright(T_world_camera: Float[ndarray, "n 4 4"]) -> Float[ndarray, "3 3"]:
+    """Rotation from world to scene axes: z is the cameras' mean up, x as close as possible to the first camera's right.
+
+    If the cameras roll so much that they have no common up, z is the first camera's up.
+    """
+    up = T_world_camera[:, :3, 1].mean(0)
+    if np.linalg.norm(up) < _COMMON_UP:
+        up = T_world_camera[0, :3, 1]
+    z = up / np.linalg.norm(up)
+    # right and back of the first camera are perpendicular: they cannot both be parallel to z
+    across = [axis - (axis @ z) * z for axis in T_world_camera[0, :3, [0, 2]]]
+    right, back = (np.linalg.norm(axis) for axis in across)
+    x = across[0] / right if right > 0.1 else np.cross(z, across[1] / back)
+    return np.stack([x, np.cross(z, x), z])
+
+
 # Outlines of cameras and projectors, for pictures of a scene.
 
 _MARK_WIDTH, _MARK_HEIGHT = 0.25, 0.3  # of the mark above the upper edge, as shares of the image's width and height

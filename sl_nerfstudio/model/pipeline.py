@@ -29,7 +29,15 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.meshing.texture import MANY_CHARTS, draw_triangles, laid_out
 from sl_nerfstudio.model.loop import SLTrainer
 from sl_nerfstudio.model.model import SLModel
-from sl_nerfstudio.model.run_files import INTERRUPTION, SCAN_KEY, SETTINGS_KEY, as_tensor, as_text, whole_command
+from sl_nerfstudio.model.run_files import (
+    INTERRUPTION,
+    SCAN_KEY,
+    SETTINGS_KEY,
+    as_tensor,
+    as_text,
+    watch_step,
+    whole_command,
+)
 from sl_nerfstudio.model.viewer import SceneView
 from sl_nerfstudio.parallel import compiled_range, torch_on_one_thread
 
@@ -134,7 +142,7 @@ class SLPipeline(VanillaPipeline):
     - After a checkpoint is loaded for viewing or export, cameras are at their refined poses.
     - The viewer shows the scan (viewer.py), and at the end of training the next commands are printed.
     - On a GPU, kernels compute the losses of a step (kernel_step.py).
-    - Several processes average their gradients without DistributedDataParallel (processes.py).
+    - Several processes average their gradients without DistributedDataParallel (loop.py).
     """
 
     config: SLPipelineConfig
@@ -241,6 +249,7 @@ class SLPipeline(VanillaPipeline):
 
     def _update_viewer(self, step: int) -> None:
         self.scene_view.update()
+        watch_step(self._sl_model)
 
     def _say_what_next(self, step: int, trainer: Any) -> None:
         if comms.is_main_process() and not whole_command():

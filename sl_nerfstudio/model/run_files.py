@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
@@ -317,13 +317,17 @@ def require_unused(folder: Path, models: Path, method: str) -> None:
     )
 
 
-_part_of: list[str] = []
+Watch = Callable[[Any], None]
+_part_of: list[tuple[str, Watch | None]] = []
 
 
 @contextmanager
-def part_of(command: str) -> Iterator[None]:
-    """Trainings in the block are a part of `command`, which goes on with them, and itself says what is next."""
-    _part_of.append(command)
+def part_of(command: str, watch: Watch | None = None) -> Iterator[None]:
+    """Trainings in the block are a part of `command`, which goes on with them, and itself says what is next.
+
+    `watch` gets their model after each step.
+    """
+    _part_of.append((command, watch))
     try:
         yield
     finally:
@@ -332,7 +336,13 @@ def part_of(command: str) -> Iterator[None]:
 
 def whole_command() -> str:
     """The command of which trainings of this process are a part; "" if of none."""
-    return _part_of[-1] if _part_of else ""
+    return _part_of[-1][0] if _part_of else ""
+
+
+def watch_step(model: Any) -> None:
+    """Show the model to who watches this training, if anybody does."""
+    if _part_of and (watch := _part_of[-1][1]):
+        watch(model)
 
 
 def go_on_command(method: str, folder: Path) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.scripts import train
 
-from sl_nerfstudio.model.run_files import part_of, quiet_nerfstudio
+from sl_nerfstudio.model.run_files import Watch, part_of, quiet_nerfstudio
 
 
 def settings_of_run(method: str, scan: Path, output: Path, experiment: str, name: str, steps: int | None) -> Any:
@@ -18,11 +18,12 @@ def settings_of_run(method: str, scan: Path, output: Path, experiment: str, name
     return config
 
 
-def train_within(command: str, config: Any) -> None:
-    """Train a new run, or one that was stopped; `command` is what goes on with it.
+def train_within(command: str, config: Any, watch: Watch | None = None) -> None:
+    """Train a new run, or one that was stopped.
 
+    `command` is what goes on with it; `watch` gets the model after each step.
     Raises SystemExit with a message for what a user can correct, and if it is interrupted.
     """
     quiet_nerfstudio(True)
-    with part_of(command):
+    with part_of(command, watch):
         train.main(config)

@@ -15,158 +15,33 @@ import matplotlib
 import numpy as np
 import torch
 import viser
-import viser.transforms as vtf
-from jaxtyping import Bool, Float, Float64, Int64, UInt8
-from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
+from jaxtyping import Bool, Float, Float64, UInt8
+from nerfstudio.viewer.viewer import Viewer
 from nerfstudio.viewer.viewer_elements import ViewerControl
 from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
 from sl_nerfstudio.errors import UserError, first_line
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.geometry.lie import inverse, transform
-from sl_nerfstudio.geometry.triangulation import Viewpoint, beside, far_enough, triangulate
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 from sl_nerfstudio.meshing.uncertainty import vertex_uncertainty
 from sl_nerfstudio.model.outputs import TrainedModel, coordinate_colours
+from sl_nerfstudio.model.scene_nodes import (
+    CLAY,
+    COLOURS,
+    SCENE_SCALE,
+    DeviceNodes,
+    add_rods,
+    decoded_points,
+    look_at_object,
+    place,
+    pyramid_size,
+    rods,
+)
 from sl_nerfstudio.scan import Scan
-
-# Lines as thin rods: one mesh for any number of them, where the viewer has no line segments.
-
-_SIDES = 3
-
-
-def rods(segments: Float[ndarray, "n 2 3"], radius: float) -> tuple[Float[ndarray, "v 3"], Int64[ndarray, "f 3"]]:
-    """Vertices and triangles of open prisms around the segments; those without a length are left out."""
-    axis = segments[:, 1] - segments[:, 0]
-    length = np.linalg.norm(axis, axis=1)
-    kept = np.isfinite(length) & (length > 0)
-    segments, axis = segments[kept], axis[kept] / length[kept, None]
-    least = np.eye(3)[np.argmin(np.abs(axis), axis=1)]
-    u = np.cross(axis, least)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    v = np.cross(axis, u)
-    angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
-    ring = radius * (np.cos(angle)[None, :, None] * u[:, None] + np.sin(angle)[None, :, None] * v[:, None])
-    vertices = (segments[:, :, None] + ring[:, None]).reshape(-1, 3)
-    k, after = np.arange(_SIDES), (np.arange(_SIDES) + 1) % _SIDES
-    one = np.concatenate([np.stack([k, after, after + _SIDES], 1), np.stack([k, after + _SIDES, k + _SIDES], 1)])
-    faces = one[None] + 2 * _SIDES * np.arange(len(segments))[:, None, None]
-    return vertices, faces.reshape(-1, 3).astype(np.int64)
-
-
-# Cameras and projectors in the viewer's scene: pyramids at starting and current poses, the way between, and names.
-
-Colour = tuple[int, int, int]
-GREY: Colour = (130, 130, 130)
-UNPLACED_COLOUR: Colour = (230, 60, 50)
-_STARTING_SIZE = 0.8  # of the current ones
-_ROD = 0.02  # radius of the line from start to current pose, as a share of a pyramid's size
-
-
-COLOURS: dict[str, Colour] = {"camera": (90, 160, 255), "projector": (255, 140, 40)}
-
-
-class DeviceNodes:
-    """Nodes of the cameras, or of the projectors, one of each frame; poses are in the scene."""
-
-    def __init__(
-        self,
-        scene: viser.SceneApi,
-        kind: str,
-        names: Sequence[str],
-        devices: Sequence[Device],
-        start: Float64[ndarray, "n 4 4"],
-        current: Float64[ndarray, "n 4 4"],
-        scale: float,
-        image: UInt8[ndarray, "h w 3"] | None = None,
-    ) -> None:
-        """`names` are the frames'; `scale` is viser's size of a pyramid; `image` is drawn on the current ones."""
-        self._scene, self._kind, self._names, self._scale, self._image = scene, kind, names, scale, image
-        self._shapes = [(vertical_fov(device), device.w / device.h) for device in devices]
-        self.start, self.current = start, current
-        self.unplaced = [False] * len(names)
-        self.starting = [
-            scene.add_camera_frustum(f"/starting/{kind}/{name}", *shape, _STARTING_SIZE * scale, color=GREY)
-            for name, shape in zip(names, self._shapes, strict=True)
-        ]
-        for handle, T in zip(self.starting, start, strict=True):
-            place(handle, T)
-        drawn = [self._current_nodes(k) for k in range(len(names))]
-        self.refined, self.labels = [nodes[0] for nodes in drawn], [nodes[1] for nodes in drawn]
-        self.path = self._drawn_path()
-        self.move(current)
-
-    def _current_nodes(self, k: int) -> tuple[viser.CameraFrustumHandle, viser.LabelHandle]:
-        """The pyramid and the name of a frame's device at its current pose; they replace those that are there."""
-        kind, lost, path = self._kind, self.unplaced[k], f"{self._kind}/{self._names[k]}"
-        colour = UNPLACED_COLOUR if lost else COLOURS[kind]
-        pyramid = self._scene.add_camera_frustum(
-            f"/refined/{path}", *self._shapes[k], self._scale, color=colour, image=self._image
-        )
-        return pyramid, self._scene.add_label(f"/names/{path}", f"{kind} {k}: not placed" if lost else f"{kind} {k}")
-
-    def mark(self, unplaced: Sequence[bool]) -> None:
-        """Show in red, and say, which frames do not agree with the others."""
-        changed = [k for k, lost in enumerate(unplaced) if lost != self.unplaced[k]]
-        self.unplaced = list(unplaced)
-        for k in changed:
-            shown = self.refined[k].visible, self.labels[k].visible
-            self.refined[k], self.labels[k] = self._current_nodes(k)
-            self.refined[k].visible, self.labels[k].visible = shown
-        if changed:
-            self.move(self.current)
-
-    def move(self, current: Float64[ndarray, "n 4 4"]) -> None:
-        """To other current poses; the lines from the starting poses follow."""
-        for handle, label, T in zip(self.refined, self.labels, current, strict=True):
-            place(handle, T)
-            label.position = T[:3, 3] * VISER_NERFSTUDIO_SCALE_RATIO
-        if not np.array_equal(current, self.current):
-            shown = self.path.visible
-            self.current = current
-            self.path = self._drawn_path()
-            self.path.visible = shown
-
-    def show(self, *, refined: bool, starting: bool, named: Sequence[int]) -> None:
-        """Choose what is visible; `named` are the frames with a name. Lines are where both of their ends are."""
-        for handles, visible in ((self.refined, refined), (self.starting, starting)):
-            for handle in handles:
-                handle.visible = visible
-        for k, label in enumerate(self.labels):
-            label.visible = refined and k in named
-        self.path.visible = refined and starting
-
-    def _drawn_path(self) -> viser.MeshHandle:
-        ends = np.stack([self.start[:, :3, 3], self.current[:, :3, 3]], 1) * VISER_NERFSTUDIO_SCALE_RATIO
-        vertices, faces = rods(ends, _ROD * self._scale)
-        return add_rods(self._scene, f"/moved/{self._kind}", vertices, faces, COLOURS[self._kind])
-
-
-def add_rods(
-    scene: viser.SceneApi, name: str, vertices: Float[ndarray, "v 3"], faces: ndarray, colour: Colour
-) -> viser.MeshHandle:
-    """A mesh of rods; the viewer accepts no empty one, so it has an invisible triangle then."""
-    if not len(faces):
-        vertices, faces = np.zeros((3, 3)), np.array([[0, 1, 2]])
-    return scene.add_mesh_simple(name, vertices, faces, color=colour, side="double")
-
-
-def vertical_fov(device: Device) -> float:
-    """Angle in radian between the rays through the middle of the upper and of the lower edge."""
-    uv = torch.tensor([[device.w / 2, 0.0], [device.w / 2, float(device.h)]], dtype=torch.float64)
-    up, down = unproject(Intrinsics.of(device, torch.float64), uv)
-    return math.acos(max(-1.0, min(1.0, float(up @ down))))
-
-
-def place(handle: viser.CameraFrustumHandle, T_scene_device: Float64[ndarray, "4 4"]) -> None:
-    """Viser's frusta look along +z with y down; nerfstudio draws the scene ten times as large."""
-    R = vtf.SO3.from_matrix(T_scene_device[:3, :3]) @ vtf.SO3.from_x_radians(math.pi)
-    handle.wxyz = R.wxyz
-    handle.position = T_scene_device[:3, 3] * VISER_NERFSTUDIO_SCALE_RATIO
-
 
 # Rays of a frame's camera and projector through pixels that decoded the same point of the surface.
 
@@ -181,31 +56,13 @@ def pattern_rays(
 
     At most `MOST_RAYS` of the decoded pixels, evenly over the image; none where nothing was decoded.
     """
-    camera, projector = T_scene_camera.double().cpu(), T_scene_projector.double().cpu()
-    coords = scan.frames[frame].read_coords()
-    row, column = _evenly(np.isfinite(coords).all(-1))
-    uv_camera = torch.from_numpy(np.stack([column, row], 1) + 0.5)
-    uv_projector = torch.from_numpy(coords[row, column].astype(np.float64))
-    met = triangulate(
-        Intrinsics.of(scan.frames[frame].camera, torch.float64), camera, uv_camera,
-        Intrinsics.of(scan.projector, torch.float64), projector, uv_projector,
-    )  # fmt: skip
-    p = met.p_world
-    good = (met.depth_camera > 0) & (met.depth_projector > 0) & (p.norm(dim=-1) < _FARTHEST)
-    ends = p[good].numpy()
-    starts = (np.broadcast_to(T[:3, 3].numpy(), ends.shape) for T in (camera, projector))
+    camera, projector = (T.double().cpu().numpy() for T in (T_scene_camera, T_scene_projector))
+    seen = scan.frames[frame]
+    ends = decoded_points(seen.camera, scan.projector, seen.read_coords(), camera, projector, MOST_RAYS)
+    ends = ends[np.linalg.norm(ends, axis=1) < _FARTHEST]
+    starts = (np.broadcast_to(T[:3, 3], ends.shape) for T in (camera, projector))
     first, second = (np.stack([start, ends], 1) for start in starts)
     return first, second
-
-
-def _evenly(decoded: ndarray) -> tuple[ndarray, ndarray]:
-    """Rows and columns of some decoded pixels, on a square lattice that has at most `MOST_RAYS` of them."""
-    step = max(1, int((decoded.sum() / MOST_RAYS) ** 0.5))
-    while True:
-        row, column = np.nonzero(decoded[step // 2 :: step, step // 2 :: step])
-        if len(row) <= MOST_RAYS:
-            return row * step + step // 2, column * step + step // 2
-        step += 1
 
 
 # The surface of the field as a mesh for the viewer, and what it can be coloured by.
@@ -213,7 +70,6 @@ def _evenly(decoded: ndarray) -> tuple[ndarray, ndarray]:
 RENDERED, SHADED = "as rendered", "shaded"
 MODES = (RENDERED, SHADED, "normals", "depth", "coordinates", "residual", "sigma", "views")
 RESOLUTION = 192  # cells along the scene's box: seconds
-CLAY = (112, 109, 103)  # dark, because the viewer has strong lights
 UNKNOWN = (110, 110, 110)  # colour where a value does not exist
 
 
@@ -385,11 +241,7 @@ def legend(coloured: Coloured) -> str:
 
 _PATTERN_PIXELS = 256  # longest side of the pattern drawn on a projector
 _SECONDS_BETWEEN_UPDATES = 0.5
-_FRUSTUM_SIZE = 0.4  # of the devices' distance from the object, times nerfstudio's --viewer.camera-frustum-scale of 0.1
 _RAY = 0.012  # radius of a ray, as a share of a pyramid's size
-_OBJECT_RADIUS = 0.8  # scene units
-_USUAL_FOV, _USUAL_ASPECT = math.radians(75), 1.5  # of a client that has not said its own
-_MARGIN = 1.1
 
 ScenePoses = tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "n 4 4"]]
 
@@ -416,10 +268,9 @@ class SceneView(ViewerControl):
         start = self._model.S_scene_world.poses(scan.poses.stacked())
         cameras, projectors = start[: len(scan.frames)], start[len(scan.frames) :]
         # nerfstudio assumes that cameras are inside the unit box; here the object is, and they are far outside.
-        # It draws its own frusta after this, with the same setting.
-        distance = float(np.median(np.linalg.norm(cameras[:, :3, 3], axis=1)))
-        viewer.config.camera_frustum_scale *= _FRUSTUM_SIZE * distance * VISER_NERFSTUDIO_SCALE_RATIO
-        self._scale = viewer.config.camera_frustum_scale
+        # It draws its own frusta after this, with the same setting, whose default is 0.1.
+        self._scale = 10 * viewer.config.camera_frustum_scale * pyramid_size(cameras)
+        viewer.config.camera_frustum_scale = self._scale
         names, current = [frame.name for frame in scan.frames], self._numpy_poses()
         scene, pattern = self.viser_server.scene, _thumbnail(scan.read_pattern())
         devices = [frame.camera for frame in scan.frames], [scan.projector] * len(names)
@@ -477,7 +328,7 @@ class SceneView(ViewerControl):
         frame, (camera, projector) = self.panel.chosen_frame, self._model.poses_scene()
         segments = pattern_rays(self._model.scan, frame, camera[frame], projector[frame])
         for kind, ends in zip(COLOURS, segments, strict=True):
-            drawn = rods(ends * VISER_NERFSTUDIO_SCALE_RATIO, _RAY * self._scale)
+            drawn = rods(ends * SCENE_SCALE, _RAY * self._scale)
             name = f"/rays/{kind}"
             self._nodes[name] = add_rods(self.viser_server.scene, name, *drawn, COLOURS[kind])
 
@@ -504,7 +355,7 @@ class SceneView(ViewerControl):
         import trimesh  # takes half a second, and only a viewer needs it
 
         mesh = trimesh.Trimesh(
-            surface.mesh.vertices * VISER_NERFSTUDIO_SCALE_RATIO,
+            surface.mesh.vertices * SCENE_SCALE,
             surface.mesh.faces,
             vertex_colors=coloured.rgb,
             vertex_normals=surface.mesh.vertex_normals(),
@@ -557,26 +408,8 @@ class SceneView(ViewerControl):
     # ---- the first view
 
     def _look_at_object(self, client: viser.ClientHandle) -> None:
-        fov, aspect = client.camera.fov or _USUAL_FOV, client.camera.aspect or _USUAL_ASPECT
         points = None if self._surface is None else self._surface.mesh.vertices
-        view = first_view(np.concatenate(self._numpy_poses()), points, fov, aspect)
-        client.camera.up_direction = view.up
-        client.camera.position = view.eye * VISER_NERFSTUDIO_SCALE_RATIO
-        client.camera.look_at = view.centre * VISER_NERFSTUDIO_SCALE_RATIO
-
-
-def first_view(
-    T_scene_device: Float64[ndarray, "n 4 4"],
-    surface: Float64[ndarray, "v 3"] | None,
-    vertical_fov: float,
-    aspect: float,
-) -> Viewpoint:
-    """Framed on the surface, or on where it will be, beside the first device."""
-    if surface is None:
-        surface = _OBJECT_RADIUS * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
-    up, position = np.array([0.0, 0.0, 1.0]), T_scene_device[0, :3, 3]
-    direction = beside(position if np.linalg.norm(position) > 0 else T_scene_device[0, :3, 2], up)
-    return far_enough(surface, (surface.min(0) + surface.max(0)) / 2, direction, up, vertical_fov, aspect, _MARGIN)
+        look_at_object(client, np.concatenate(self._numpy_poses()), points)
 
 
 def _thumbnail(pattern: Float[ndarray, "h w"]) -> UInt8[ndarray, "h2 w2 3"]:

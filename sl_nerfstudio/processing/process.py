@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from sl_nerfstudio.bundle_adjustment.registered_frames import keep_registered
 from sl_nerfstudio.console import phase, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import DevicePoses
@@ -214,10 +215,12 @@ def _image(worker: FrameWorker, frame: FrameStageResult, shown: int) -> Pixels |
 
 MakeReport = Callable[[ProcessResult, Sequence[Preview]], str]
 Log = Callable[[str], None]
+Watch = Callable[[Sequence[FrameCloud], DevicePoses, str], None]
+"""Gets the frames, their poses (NaN where a frame was left out), and the word for what was done with them."""
 
 
-def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> ProcessResult:
-    """Make the scan folder; `log` gets a line of text for every stage.
+def process(config: ProcessConfig, make_report: MakeReport, log: Log, watch: Watch | None = None) -> ProcessResult:
+    """Make the scan folder; `log` gets a line of text for every stage, `watch` the poses as soon as they are known.
 
     Raises UserError for flags and files that are wrong, and if fewer than two frames can be used: their report is then
     in the work folder.
@@ -229,11 +232,16 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log) -> Process
     earlier = written_scan(config)
     renewed = () if earlier is None else tuple(earlier.files)
     with NewFolder(config.output, renewed) as folder, work_folder(config.work_folder):
-        return _process(config, folder, earlier, make_report, log)
+        return _process(config, folder, earlier, make_report, log, watch)
 
 
 def _process(
-    config: ProcessConfig, folder: NewFolder, earlier: WrittenScan | None, make_report: MakeReport, log: Log
+    config: ProcessConfig,
+    folder: NewFolder,
+    earlier: WrittenScan | None,
+    make_report: MakeReport,
+    log: Log,
+    watch: Watch | None,
 ) -> ProcessResult:
     with phase("read"):
         inputs = read_inputs(config)
@@ -255,12 +263,17 @@ def _process(
         given = _given(inputs, frames.results)
         frames, registration = _register(config, inputs, frames, given, log)
         _require_registered(config, inputs, frames.results, registration, wrong, make_report)
+        if watch is not None:
+            clouds = clouds_of(frames.results)
+            watch(clouds, keep_registered(clouds, registration).poses, "registered")
     with phase("adjust"):
         frames, consistent = _adjust(config, inputs, frames, registration, log)
         frames, consistent, moving = _register_what_moves(config, inputs, frames, consistent, log)
         both = consistent.adjusted.median_before_px, consistent.adjusted.median_after_px
         if np.isfinite(both).all():
             log("frames agree to {1:.2f} px, {0:.2f} px before".format(*both))
+        if watch is not None:
+            watch(clouds_of(frames.results), consistent.adjusted.poses, "adjusted together")
     with phase("write"):
         result = _write(config, inputs, frames, consistent, moving, wrong, folder, make_report, log)
         note_scan(config, folder, digest)

@@ -4,18 +4,28 @@ import json
 import os
 import shutil
 import signal
+import socket
+import threading
+import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import trimesh
 from nerfstudio.scripts import train as ns_train
 from nerfstudio.utils import writer
+from scipy.spatial import KDTree
+from scipy.spatial.distance import pdist
+from viser._messages import ViewerCameraMessage
+from websockets.sync.client import connect
 
 from sl_nerfstudio.cli import scan as module
 from sl_nerfstudio.cli.scan import ScanConfig, main
 from sl_nerfstudio.meshing.files import read_mesh
+from sl_nerfstudio.model import preview
 from sl_nerfstudio.model.loop import SLTrainer
+from sl_nerfstudio.model.preview import Preview
 from sl_nerfstudio.scan import read_poses, read_scan
 from sl_nerfstudio.scan.images import encode_png, read_image
 from tests.processing.gray_scan import GrayScan, make_gray_scan
@@ -169,6 +179,80 @@ def test_a_scan_folder_begins_with_the_training_and_another_quality_is_another_r
     assert (output / "mesh.glb").read_bytes() == (done[0] / "mesh.glb").read_bytes()
     assert len(list((output / "training/sl-neus").iterdir())) == 1
     assert ScanConfig(scan, output, quality="draft").better.quality == "normal"
+
+
+class Browser(threading.Thread):
+    """Connects to a preview as a browser does, and notes all that it gets until the connection ends."""
+
+    def __init__(self, preview: Preview) -> None:
+        super().__init__(daemon=True)
+        self.port, self.got = preview._server.get_port(), []
+        self.start()
+        while not preview._server.get_clients():
+            time.sleep(0.01)
+
+    def run(self) -> None:
+        eye = ViewerCameraMessage((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 5.0), 1.0, 1.5, (0.0, 0.0, 0.0), (0.0, 1.0, 0.0))
+        with connect(f"ws://127.0.0.1:{self.port}", max_size=None) as connection:
+            connection.send(msgspec.msgpack.encode(eye.as_serializable_dict()))
+            for window in connection:
+                self.got += msgspec.msgpack.decode(window)
+
+    def of(self, kind: str) -> dict[str, dict]:
+        """The last message of a kind about each node."""
+        return {message["name"]: message for message in self.got if message["type"] == kind}
+
+
+def test_a_preview_shows_frames_and_surface_ends_with_the_command_and_changes_no_byte(
+    done, captures, tmp_path, monkeypatch
+):
+    open_preview, browsers = module._opened_preview, []
+
+    def opened(config):
+        browsers.append(Browser(found := open_preview(config)))
+        return found
+
+    monkeypatch.setattr(module, "_opened_preview", opened)
+    monkeypatch.setattr(preview, "_TRAINING_PER_DRAWING", 0)  # the surface after every step
+    output = tmp_path / "r"
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        monkeypatch.setattr(preview, "PORT", port)
+        said = succeed(main, "sl-scan", *words(captures, output, "--preview")).words
+    (browser,) = browsers
+    assert browser.port > port
+    assert f" 127.0.0.1:{browser.port} (open it" in said and f"port {port} is in use by another program" in said
+    browser.join(10)
+    assert not browser.is_alive()
+    with pytest.raises(OSError):
+        socket.create_connection(("127.0.0.1", browser.port))
+
+    names = [f"pose {k}" for k in range(4)]
+    words_shown = [str(m["updates"]) for m in browser.got if m["type"] == "GuiUpdateMessage"]
+    assert [
+        any(text in shown for shown in words_shown)
+        for text in ("4 of 4 frames registered", "4 of 4 frames adjusted together", f"training, step {STEPS - 1}")
+    ] == [True] * 3
+    clouds = {name: np.frombuffer(m["points"], np.float32).reshape(-1, 3)
+              for name, m in browser.of("PointCloudMessage").items()}  # fmt: skip
+    assert sorted(clouds) == [f"/points/{name}" for name in names]
+    assert all(500 < len(points) <= preview._MOST_OF_A_FRAME for points in clouds.values())
+    first, *others = clouds.values()
+    assert np.median(KDTree(np.concatenate(others)).query(first)[0]) < 0.02 * np.ptp(first, axis=0).max()
+    assert set(browser.of("CameraFrustumMessage")) == {
+        f"/{kind}s/{n}" for kind in ("camera", "projector") for n in names
+    }
+    at = browser.of("SetPositionMessage")
+    poses = read_poses(output / "poses/transforms.json", read_scan(output / "scan"))
+    for kind, T in (("camera", poses.T_world_camera), ("projector", poses.T_world_projector)):
+        ratio = pdist([at[f"/{kind}s/{name}"]["position"] for name in names]) / pdist(T[:, :3, 3])
+        np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)
+    surface = browser.of("MeshMessage")["/surface"]
+    assert len(surface["faces"]) > 1000
+
+    for kind in ("mesh.*", "poses/*.npz", "poses/transforms.json", "scan/**/*.npz", "training/**/*.ckpt"):
+        made, plain = ({path.name: path.read_bytes() for path in root.glob(kind)} for root in (output, done[0]))
+        assert made and [name for name in made | plain if made.get(name) != plain.get(name)] == []
 
 
 def test_what_cannot_be_is_refused(done, result, captures, tmp_path, monkeypatch):

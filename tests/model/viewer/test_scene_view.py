@@ -12,7 +12,8 @@ import viser.transforms as vtf
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.mesh import VertexQuality
-from sl_nerfstudio.model.viewer import MODES, UNKNOWN, DeviceNodes, SceneView, ViewerSurface, first_view, vertical_fov
+from sl_nerfstudio.model.scene_nodes import DeviceNodes, first_view, vertical_fov
+from sl_nerfstudio.model.viewer import MODES, UNKNOWN, SceneView, ViewerSurface
 from tests.dataparser.tiny_scan import RADIUS
 from tests.model.viewer.conftest import SCALE
 
