@@ -44,7 +44,7 @@ def decode_image(
             Gray code one for each image of the sequence, in its order.
         pattern: what was projected: a layout, or its pattern.json.
 
-    Every pixel is decoded, which takes a minute for 24 million of them; 12 pixels a period of the pattern are enough.
+    Every pixel is decoded; of large photographs, 12 pixels a period of the pattern are enough and far faster.
     Returns coordinates (h, w, 2) in projector pixels, NaN where they are not known, the mask (h, w) that the pattern
     lights, and the normalised pattern (h, w). Raises UserError for files that cannot be read, and DecodingError, one
     of those, for a capture in which the pattern is not found.

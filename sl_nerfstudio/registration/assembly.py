@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
@@ -28,6 +28,10 @@ from sl_nerfstudio.registration.pose_graph import Component, Pivots, optimise_at
 MOST_COMPARED = 12  # clearly different similarities between two components
 MOST_PAIRS = 10  # of frames across two components that are compared
 MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
+BASELINE_SIGMA = (
+    0.5  # of the logarithm of a frame's baseline: who moves two devices keeps their distance to a factor or so
+)
+LARGEST_BASELINE = 10.0  # ratio of two frames' baselines, beyond which a surface has collapsed onto a patch of another
 LEAST_SIGHT_COSINE = float(np.cos(np.radians(75.0)))  # between lines of sight: beyond it frames share no surface
 
 
@@ -45,6 +49,15 @@ class Decision:
 
     S_first_second: Similarity
     lead: float
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """Another place of a frame."""
+
+    S_world_world: Similarity  # that moves it there
+    by_surface: float  # by how many nats it is more likely there
+    by_order: float  # the same by the order of capture
 
 
 Prior = Callable[[int, int, Similarity], float]
@@ -141,9 +154,37 @@ class Assembly:
         S = self._between_worlds(first, second, nodes[best])
         return Decision(S, float(min(both[best, others], default=found.odds[best])))
 
+    def elsewhere(self, rest: Component, frame: int, here: Similarity) -> list[Elsewhere]:
+        """Clearly different places of one frame of a component that its pairs say, if they may be about as likely.
+
+        `rest`: the other frames of the component, `here`: the frame's node.
+        """
+        second = {frame: here}
+        places = [Similarity.identity()]
+        places += [S for S in self._proposed(rest, second) if self._differ(S, places[0], second)]
+        if len(places) == 1:
+            return []
+        nodes = [self._placed(rest, frame, S @ here) for S in places]
+        found = self.compare(rest, second, nodes)
+        usual = [self.usual(rest, second, at) for at in nodes]
+        either = np.maximum(found.leads[:, 0], replace(found, alike=np.ones_like(found.alike)).leads[:, 0])
+        out: list[Elsewhere] = []
+        for k, S in enumerate(places):
+            order = usual[k] - usual[0]
+            unlikely = found.odds[k] < LEAST_ODDS or either[k] + max(order, 0) <= -LEAST_ODDS
+            if k == 0 or unlikely or not self.differ(rest, second, nodes[0], nodes[k]):
+                continue
+            leads = replace(found, alike=np.full_like(found.alike, self.looks_alike(rest, S))).leads
+            out.append(Elsewhere(S, float(leads[k, 0]), order))
+        return out
+
     def _proposed(self, first: Component, second: Component) -> list[Similarity]:
         """The clearly different similarities between two components that pairs across say, the most likely first."""
         links = [link for e in self._between(first, second) for link in self._links(e, first, second)]
+        one, two = (float(np.mean([np.log(S.scale) for S in part.values()])) for part in (first, second))
+        links = [
+            link for link in links if abs(np.log(link.S_first_second.scale) + two - one) < np.log(LARGEST_BASELINE)
+        ]
         distinct: list[Similarity] = []
         for link in sorted(links, key=lambda one: -one.log_odds):
             if len(distinct) == MOST_COMPARED:
@@ -158,11 +199,20 @@ class Assembly:
         Components have errors of scale that add up around an object: rigid ones would not fit on both of their ends.
         """
         both = {**first, **{k: S_first_second @ S for k, S in second.items()}}
-        known = [
-            e for e in self._between(first, second) if e.log_odds_at(relative(both, e.source, e.target)) is not None
-        ]
+        known = self._known_across(first, second, both)
         inside = [e for part in (first, second) for e in self.edges if e.source in part and e.target in part]
         return optimise_at_places([*inside, *known], self.pivots, both).S_world_camera
+
+    def _placed(self, rest: Component, frame: int, S_world_camera: Similarity) -> Component:
+        """The same for one frame among others that stay."""
+        both = {**rest, frame: S_world_camera}
+        known = self._known_across(rest, {frame: S_world_camera}, both)
+        return optimise_at_places(known, self.pivots, both, [frame]).S_world_camera
+
+    def _known_across(self, first: Component, second: Component, nodes: Component) -> list[PairMatch]:
+        """The pairs across two components that know where their frames are."""
+        across = self._between(first, second)
+        return [e for e in across if e.log_odds_at(relative(nodes, e.source, e.target)) is not None]
 
     @staticmethod
     def _between_worlds(first: Component, second: Component, both: Component) -> Similarity:
@@ -188,6 +238,7 @@ class Assembly:
             here = [relative(at, j, i) if see_same_side(at[i], at[j]) else None for at in nodes]
             found += self._scan.comparison(j, i, here).scaled(2 / (degree[i] + degree[j]))
         found += self._by_tone(first, second, nodes)
+        found += by_odds([self.usual_baselines(first, second, at) for at in nodes])
         return replace(found, alike=found.alike | alike)
 
     def _by_tone(self, first: Component, second: Component, nodes: Sequence[Component]) -> Comparison:
@@ -199,7 +250,13 @@ class Assembly:
             for k, at in enumerate(nodes):
                 if e.log_odds_at(relative(at, e.source, e.target)) is not None:
                     odds[k] += TONE_ODDS * 2 / (degree[e.source] + degree[e.target])
-        return replace(Comparison.none(len(nodes)), shared=odds[:, None] - odds, odds=odds)
+        return by_odds(odds)
+
+    @staticmethod
+    def usual_baselines(first: Component, second: Component, nodes: Component) -> float:
+        """Log-odds of the ratio of the baselines of two components: a surface that collapses fits anywhere."""
+        one, two = (float(np.mean([np.log(nodes[k].scale) for k in part])) for part in (first, second))
+        return -0.5 * ((one - two) / BASELINE_SIGMA) ** 2
 
     def looks_alike(self, nodes: Component, turn: Similarity) -> bool:
         """Whether the surface looks the same after a turn of the world, as a box does.
@@ -234,8 +291,9 @@ class Assembly:
         out = np.zeros((len(places), len(places)), dtype=bool)
         for k, S in enumerate(places):
             for m, other in enumerate(places[:k]):
-                turns = ((first, S @ other.inverse()), (second, S.inverse() @ other))
-                out[k, m] = out[m, k] = any(self.looks_alike(part, turn) for part, turn in turns)
+                out[k, m] = out[m, k] = self.looks_alike(first, S @ other.inverse()) or self.looks_alike(
+                    second, S.inverse() @ other
+                )
         return out
 
     def differ(self, first: Component, second: Component, a: Component, b: Component) -> bool:
@@ -275,6 +333,12 @@ class Assembly:
             p, radius = S.points(self.pivots.centre[k][None]), a.scale * S.scale * self.pivots.radius[k]
             shifts.append(float(np.linalg.norm(a.points(p) - b.points(p))) / radius)
         return bool(min(shifts) > SAME_PLACE_SHIFT)
+
+
+def by_odds(odds: Sequence[float] | Float64[ndarray, "k"]) -> Comparison:
+    """Places compared by log-odds of each."""
+    each = np.array(odds, dtype=np.float64)
+    return replace(Comparison.none(len(each)), shared=each[:, None] - each, odds=each)
 
 
 def relative(nodes: Component, source: int, target: int) -> Similarity:

@@ -3,26 +3,29 @@
 Frames are joined one after the other, so a join that was nearly open may have put a whole block of them where it fits
 less well. Every turn of the world that some pair says is tried on the block for which it gains most, by the log-odds of
 all pairs of frames across its border: which frames belong to it is a cut of a graph (Kernighan and Lin, 1970). Blocks
-move to where they are likelier. A block that is nearly as likely elsewhere is not decided, and stays apart.
+move to where they are likelier. Then each frame alone is tried at all places that its pairs say, by all frames that
+face it there: the pair that held it may have slipped. A block that is nearly as likely elsewhere is not decided, and
+stays apart.
 """
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import MOST_AGAINST, Assembly
+from sl_nerfstudio.registration.assembly import LARGEST_BASELINE, MOST_AGAINST, Assembly, Elsewhere
 from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_TURN_DEG, TONE_ODDS, PairMatch
-from sl_nerfstudio.registration.pose_graph import Component, optimise_at_places
+from sl_nerfstudio.registration.pose_graph import Component, optimise_at_places, optimise_known
 
 MOST_TURNS = 48  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
 LEAST_GAIN = 1.0  # nats by which a block must fit better elsewhere to be moved
 LEAST_SIDE_DEG = 20.0  # between two sides of an object
+ADJUSTED_DEG = 6.0  # between two places, up to which the joint adjustment leads from one to the other
 STARTS = 24  # frames from which a block is grown
 
 
@@ -54,11 +57,6 @@ class Turn:
     by_surface: Float64[ndarray, "n n"]
     by_order: Float64[ndarray, "n n"]
 
-    @property
-    def to_another_side(self) -> bool:
-        """Whether the order of capture may decide it: smaller turns are slides along a surface."""
-        return angle_deg(self.S_world_world.R) >= LEAST_SIDE_DEG
-
 
 @dataclass(frozen=True)
 class Cut:
@@ -66,7 +64,8 @@ class Cut:
 
     gain: float
     block: Bool[ndarray, "n"]
-    turn: Turn
+    S_world_world: Similarity
+    alike: bool  # the surface looks the same after it
 
 
 class BlockReview:
@@ -75,21 +74,28 @@ class BlockReview:
     def __init__(self, assembly: Assembly, component: Component) -> None:
         self._assembly, self._pivots, self._prior = assembly, assembly.pivots, assembly.prior
         self._edges = [e for e in assembly.edges if e.source in component and e.target in component]
+        self._elsewhere: dict[int, tuple[Component, list[Elsewhere]]] = {}  # places of frames, and among which others
         self._degree = Counter(k for e in self._edges for k in (e.source, e.target))
         self.nodes = optimise_at_places(self._edges, self._pivots, component).S_world_camera
 
     def settled(self) -> Settled:
         """Move blocks to where they are likeliest; take out those whose place is not decided."""
+        turns = self._turns()
         for _ in range(MOST_MOVES):
-            turns = self._turns()
             cuts = sorted((best_block(t.by_surface + t.by_order, t) for t in turns), key=lambda cut: -cut.gain)
             likely = (cut for cut in cuts if cut.gain > LEAST_GAIN and self._verified(cut) > LEAST_GAIN)
-            if (cut := next(likely, None)) is None:
+            cut = next(likely, None) or self._likeliest_frame(np.ones(len(self.nodes), dtype=bool))
+            if cut is None or cut.gain <= LEAST_GAIN:
                 break
             moved = self._frames(cut.block)
-            nodes = {k: cut.turn.S_world_world @ S if k in moved else S for k, S in self.nodes.items()}
-            self.nodes = optimise_at_places(self._edges, self._pivots, nodes).S_world_camera
-        turns = self._turns()
+            nodes = {k: cut.S_world_world @ S if k in moved else S for k, S in self.nodes.items()}
+            there = optimise_known(self._edges, self._pivots, nodes).S_world_camera
+            rest = {k: S for k, S in self.nodes.items() if k not in moved}
+            if not self._assembly.differ(rest, {k: self.nodes[k] for k in moved}, self.nodes, there):
+                break  # its pairs take it back
+            self.nodes = there
+            self._elsewhere.clear()
+            turns = self._turns()
         open_ = self._open(turns, with_order=True)
         without = open_ if self._prior is None else self._open(turns, with_order=False)
         out = {k for block in open_ for k in block.nodes}
@@ -101,28 +107,64 @@ class BlockReview:
         )
 
     def _open(self, turns: Sequence[Turn], with_order: bool) -> list[OpenBlock]:
-        """Blocks whose place is not decided, one after the other: of two parts the smaller is taken out."""
+        """Blocks whose place is not decided, one after the other: of two parts the smaller is taken out.
+
+        Between places so close to each other that the joint adjustment leads from one to the other it decides.
+        """
         n, left = len(self.nodes), np.arange(len(self.nodes))
         found: list[OpenBlock] = []
         while len(left) > 1:
             cuts: list[Cut] = []
             for turn in turns:
-                gain = turn.by_surface + turn.by_order if with_order and turn.to_another_side else turn.by_surface
+                if angle_deg(turn.S_world_world.R) < ADJUSTED_DEG:
+                    continue
+                by_order = with_order and is_another_side(turn.S_world_world)
+                gain = turn.by_surface + turn.by_order if by_order else turn.by_surface
                 part = best_block(gain[np.ix_(left, left)], turn)
                 block = np.zeros(n, dtype=bool)
                 block[left[part.block]] = True
-                cuts.append(Cut(part.gain, block, turn))
+                cuts.append(replace(part, block=block))
             inside = np.isin(np.arange(n), left)
             likely = [cut for cut in sorted(cuts, key=lambda cut: -cut.gain) if cut.gain > -LEAST_ODDS]
-            verified = ((cut, self._verified(cut, inside, with_order and cut.turn.to_another_side)) for cut in likely)
-            cut, gain = next((one for one in verified if one[1] > -LEAST_ODDS), (None, 0.0))
-            if cut is None:
+            verified = (
+                replace(cut, gain=self._verified(cut, inside, with_order and is_another_side(cut.S_world_world)))
+                for cut in likely
+            )
+            cut = next((one for one in verified if one.gain > -LEAST_ODDS), None)
+            cut = cut or self._likeliest_frame(inside, with_order, ADJUSTED_DEG)
+            if cut is None or cut.gain <= -LEAST_ODDS:
                 break
             block = cut.block if 2 * cut.block.sum() <= len(left) else inside & ~cut.block
             nodes = {k: self.nodes[k] for k in sorted(self._frames(block))}
-            found.append(OpenBlock(nodes, angle_deg(cut.turn.S_world_world.R), -gain))
+            found.append(OpenBlock(nodes, angle_deg(cut.S_world_world.R), -cut.gain))
             left = np.flatnonzero(inside & ~block)
         return found
+
+    def _likeliest_frame(
+        self, inside: Bool[ndarray, "n"], with_order: bool = True, from_deg: float = 0.0
+    ) -> Cut | None:
+        """The frame that gains most elsewhere by all others inside, whichever of its pairs says so."""
+        best: Cut | None = None
+        rest = {k: S for (k, S), here in zip(self.nodes.items(), inside, strict=True) if here}
+        for number, (frame, S) in enumerate(self.nodes.items()):
+            if not inside[number] or len(rest) < 2:
+                continue
+            for place in self._places_of(frame, S, rest):
+                if angle_deg(place.S_world_world.R) < from_deg:
+                    continue
+                by_order = with_order and is_another_side(place.S_world_world)
+                gain = place.by_surface + (place.by_order if by_order else 0.0)
+                if best is None or gain > best.gain:
+                    best = Cut(gain, np.arange(len(self.nodes)) == number, place.S_world_world, alike=False)
+        return best
+
+    def _places_of(self, frame: int, here: Similarity, rest: Component) -> list[Elsewhere]:
+        """Other places of a frame; none for one that more frames than these have held already."""
+        known = self._elsewhere.get(frame)
+        if known is None or (known[1] and len(known[0]) != len(rest)):
+            others = {k: S for k, S in rest.items() if k != frame}
+            known = self._elsewhere[frame] = rest, self._assembly.elsewhere(others, frame, here)
+        return known[1]
 
     def _frames(self, block: Bool[ndarray, "n"]) -> set[int]:
         return set(np.array(list(self.nodes))[block].tolist())
@@ -132,11 +174,14 @@ class BlockReview:
         moved = self._frames(cut.block)
         kept = self._frames(~cut.block if inside is None else inside & ~cut.block)
         first, second = ({k: self.nodes[k] for k in sorted(part)} for part in (kept, moved))
-        places = (Similarity.identity(), cut.turn.S_world_world)
+        places = (Similarity.identity(), cut.S_world_world)
         nodes = [self._assembly.settled(first, second, S) for S in places]
         if not self._assembly.differ(first, second, *nodes):
             return -np.inf  # its frames move back
-        gain = float(self._assembly.compare(first, second, nodes, cut.turn.alike).leads[1, 0])
+        found = self._assembly.compare(first, second, nodes, cut.alike)
+        if found.odds[1] < LEAST_ODDS:
+            return -np.inf  # nothing speaks for it: what contradicts at one place need not be at another
+        gain = float(found.leads[1, 0])
         if with_order:
             gain += self._assembly.usual(first, second, nodes[1]) - self._assembly.usual(first, second, nodes[0])
         return gain
@@ -179,6 +224,11 @@ class BlockReview:
         return Turn(turn, alike, surface, order)
 
 
+def is_another_side(turn: Similarity) -> bool:
+    """Whether the order of capture may decide a turn: smaller ones are slides along a surface."""
+    return angle_deg(turn.R) >= LEAST_SIDE_DEG
+
+
 def _distinct(sorted_deg: Sequence[float]) -> tuple[float, ...]:
     """Angles without those that are close to the one before."""
     found: list[float] = []
@@ -204,6 +254,8 @@ def turns_said(edges: Sequence[PairMatch], nodes: Component) -> list[Similarity]
     for _, turn in sorted(said, key=lambda one: -one[0]):
         if len(found) == MOST_TURNS:
             break
+        if abs(np.log(turn.scale)) > np.log(LARGEST_BASELINE):
+            continue
         if np.einsum("kij,ij->k", known[: 1 + len(found)], turn.R).max() < closest:
             found.append(turn)
             known[len(found)] = turn.R
@@ -227,4 +279,4 @@ def best_block(gain: Float64[ndarray, "n n"], turn: Turn) -> Cut:
             if total > most:
                 most, best = total, block.copy()
             nearest = int(np.where(block, -np.inf, more).argmax())
-    return Cut(most, best, turn)
+    return Cut(most, best, turn.S_world_world, turn.alike)

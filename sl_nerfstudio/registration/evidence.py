@@ -74,7 +74,11 @@ LARGEST_LEAD = 1e6  # nats: of the only place
 
 NEAR_THINNED = 3  # only each so-manieth point is used to find the most likely place close to one
 NEAR_WIDTHS = (10.0, 7.0, 5.0, 4.0)  # of the kernel on the way there, sigmas
-NEAR_DEG, NEAR_SHIFT = 2.0, 0.08  # how far that may be: degrees, radii
+NEAR_DEG, NEAR_SHIFT = (
+    2.0,
+    0.08,
+)  # how far that may be: degrees, radii beside what errors of both relative poses explain
+NEAR_SIGMAS = 3.0  # of these
 
 CONTRADICTING_SIGMAS = 3.0  # behind the surface, from which it is asked whether an edge hides a point
 STEEPEST = 5.0  # change of distance from place to place, in their width, beyond which a surface has an edge
@@ -97,6 +101,7 @@ class FrameEvidence:
     radius: float
     area: float  # points that count as one
     usual_sigma: float  # of the distances, on smooth surface
+    depth_sigma: float  # of the surface as a whole along its rays, by the errors of the relative pose
 
     @property
     def hidden(self) -> float:
@@ -157,6 +162,7 @@ def frame_evidence(cloud: FrameCloud) -> FrameEvidence:
         np.ascontiguousarray(points), place, centroid, radius,
         max(CORRELATION_AREA * (max(w, h) / LARGEST_SIDE) ** 2 / step**2, len(place) / INDEPENDENT, 1.0),
         float(np.median(sigma[usable])) if usable.any() else 1.0,
+        float(np.linalg.norm(cloud.pose_errors.mean(0))),
     )  # fmt: skip
 
 
@@ -751,7 +757,8 @@ class ScanEvidence:
         turned = np.degrees(np.arccos(np.clip((np.einsum("kij,kij->k", near.R, start.R) - 1) / 2, -1, 1)))
         p = np.einsum("kji,kj->ki", start.R, b.centroid - start.t) / start.scale[:, None]
         shift = near.scale[:, None] * np.einsum("kij,kj->ki", near.R, p) + near.t - b.centroid
-        left = (turned > NEAR_DEG) | (np.linalg.norm(shift, axis=1) > NEAR_SHIFT * b.radius)
+        by_poses = NEAR_SIGMAS * np.hypot(start.scale * a.depth_sigma, b.depth_sigma)
+        left = (turned > NEAR_DEG) | (np.linalg.norm(shift, axis=1) > NEAR_SHIFT * b.radius + by_poses)
         both = Places.joined([start, near])
         chosen = both[np.where(left, 0, len(start)) + np.arange(len(start))]
         noise = float(self.noise[source]), float(self.noise[target])

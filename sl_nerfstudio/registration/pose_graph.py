@@ -106,11 +106,12 @@ class PoseGraphSolution:
 
 
 def optimise_pose_graph(
-    edges: Sequence[PairMatch], pivots: Pivots, start: Mapping[int, Similarity], weight: Float64[ndarray, "edges"]
-) -> PoseGraphSolution:
+    edges: Sequence[PairMatch], pivots: Pivots, start: Mapping[int, Similarity], weight: Float64[ndarray, "edges"],
+    free: Sequence[int] | None = None,
+) -> PoseGraphSolution:  # fmt: skip
     """Optimise all edges inside a component together, robustly, each with its weight.
 
-    The first frame of `start` stays.
+    `free`: the frames that may move; None: all but the first of `start`.
     """
     nodes = {k: start[k] for k in sorted(start)}
     inside = np.array([e.source in start and e.target in start for e in edges], dtype=bool)
@@ -120,8 +121,8 @@ def optimise_pose_graph(
         arrays = EdgeArrays.of(connected)
         every = Similarities.of([nodes.get(k, Similarity.identity()) for k in range(len(pivots))]).orthonormal()
         root = next(iter(start))
-        free = np.array([k for k in nodes if k != root], dtype=np.int64)
-        every = _optimised(arrays, every, pivots, free, weight[inside])
+        moving = np.array([k for k in nodes if k != root] if free is None else free, dtype=np.int64)
+        every = _optimised(arrays, every, pivots, moving, weight[inside])
         chi2[inside] = arrays.chi_square(arrays.residuals(every, pivots))
         each = every.each()
         nodes = {k: each[k] for k in nodes}
@@ -129,10 +130,21 @@ def optimise_pose_graph(
 
 
 def optimise_at_places(
-    edges: Sequence[PairMatch], pivots: Pivots, start: Mapping[int, Similarity]
+    edges: Sequence[PairMatch], pivots: Pivots, start: Mapping[int, Similarity], free: Sequence[int] | None = None
 ) -> PoseGraphSolution:
     """Optimise all edges inside a component together, each at its place nearest to where its frames are."""
-    return optimise_pose_graph(at_places(edges, start), pivots, start, edge_weights(edges))
+    return optimise_pose_graph(at_places(edges, start), pivots, start, edge_weights(edges), free)
+
+
+def optimise_known(edges: Sequence[PairMatch], pivots: Pivots, start: Mapping[int, Similarity]) -> PoseGraphSolution:
+    """The same with frames that are about where they belong: pairs that do not know that place have no say."""
+
+    def knows(e: PairMatch) -> bool:
+        inside = e.source in start and e.target in start
+        return inside and e.log_odds_at(start[e.target].inverse() @ start[e.source]) is not None
+
+    weight = edge_weights(edges) * np.array([knows(e) for e in edges], dtype=np.float64)
+    return optimise_pose_graph(at_places(edges, start), pivots, start, weight)
 
 
 def _optimised(

@@ -35,7 +35,7 @@ from sl_nerfstudio.registration.pose_graph import (
     Component,
     Pivots,
     PoseGraphSolution,
-    optimise_at_places,
+    optimise_known,
 )
 from sl_nerfstudio.registration.surfaces import SurfaceMap
 
@@ -222,8 +222,8 @@ class ViewGraph:
         Pairs that may slip connect nothing, unless all of them may: then the surface is one of revolution, and its
         frames are put together all the same.
         """
-        edges, scan = self.edges, self.evidence()
         self.by_order, self.open, self.turns_deg = False, [], ()
+        edges, scan = self.edges, self.evidence()
         assembly = self.assembly([e for e in edges if e.holds], scan)
         components = assembly.grow()
         if len(components[0]) == 1:
@@ -280,7 +280,7 @@ class ViewGraph:
 
     def solve(self, component: Component) -> PoseGraphSolution:
         """A component with the pairs that hold it optimised together, each where its frames are."""
-        return optimise_at_places(self.holding(component), self.pivots, component)
+        return optimise_known(self.holding(component), self.pivots, component)
 
     def holding(self, component: Component) -> list[PairMatch]:
         """The pairs, without those inside a component that may slip, if the others hold it together."""

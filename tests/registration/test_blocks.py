@@ -1,5 +1,7 @@
 """Blocks of frames that fit as well, or better, elsewhere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -89,6 +91,45 @@ def test_what_no_pair_decides_is_taken_out_with_its_turn_and_its_odds():
     assert sorted(block.nodes) == [3, 4, 5] and block.turn_deg == pytest.approx(TURN, abs=0.1)
     assert 0 <= block.log_odds < 10
     assert off_deg({**found.decided, **block.nodes}) < 0.1 and not found.by_order
+
+
+class Seen(Said):
+    """An assembly in which surfaces say by how much frames are off, whatever the pairs say."""
+
+    def looks_alike(self, nodes, turn) -> bool:
+        return False
+
+    def compare(self, first, second, nodes, alike=False) -> Comparison:
+        off = [
+            sum(
+                angle_deg(relative(at, i, j).R @ relative(dict(enumerate(NODES)), i, j).R.T)
+                for i in first
+                for j in second
+            )
+            for at in nodes
+        ]
+        none, odds = Comparison.none(len(nodes)), -np.array(off)
+        none.shared[:] = odds[:, None] - odds
+        return none
+
+
+def test_a_frame_that_one_pair_holds_at_a_wrong_place_is_put_where_the_others_see_it():
+    """The wrong pair is ten times as certain, and no other knows its place better than the right one."""
+    slipped = about_axis(8.0) @ NODES[4]
+    edges = []
+    for e in pairs(-30.0):
+        if {e.source, e.target} == {4, 5}:
+            wrong = NODES[e.target].inverse() @ slipped if e.source == 4 else slipped.inverse() @ NODES[e.source]
+            edges.append(replace(e, S_target_source=wrong, rivals=(), information=e.information))
+        elif 4 in (e.source, e.target):
+            there = NODES[e.target].inverse() @ slipped if e.source == 4 else slipped.inverse() @ NODES[e.source]
+            edges.append(replace(e, rivals=(Rival(there, -8.0),), information=e.information / 100))
+        else:
+            edges.append(e)
+    start = {**dict(enumerate(NODES)), 4: slipped}
+    found = BlockReview(Seen(edges, None), start).settled()
+    assert sorted(found.decided) == list(range(FRAMES)) and not found.open
+    assert off_deg(found.decided) < 0.1
 
 
 def test_the_order_of_capture_keeps_what_surfaces_leave_open_and_that_is_said():
