@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.registration.assembly import Assembly
 from sl_nerfstudio.registration.evidence import Commonness, FrameEvidence, ScanEvidence, frame_evidence
 from sl_nerfstudio.registration.pairs import LEAST_ODDS, PairMatch, Rival
 from sl_nerfstudio.registration.pose_graph import Pivots
-from tests.bundle_adjustment.analytic import rig_of
+from sl_nerfstudio.registration.surfaces import frame_cloud
+from tests.bundle_adjustment.analytic import camera_of, images_of, rig_of
 from tests.registration.analytic_clouds import clouds_of, difference, part_of, rolled, similarities_of
 from tests.registration.graph_edges import edge, turned
 from tests.registration.shaped_clouds import cloud_of_depth, relief
@@ -28,11 +30,14 @@ def frames() -> list[FrameEvidence]:
     return [frame_evidence(c) for c in clouds_of(RIG, SIZE, noise=0.1)]
 
 
-def assembly_of(frames, edges, **kwargs) -> Assembly:
+def evidence_of(frames) -> ScanEvidence:
     """Of frames of whose points no pair has shown anything."""
-    scan = ScanEvidence(frames, [Commonness.none(len(f.points)) for f in frames], np.ones(len(frames)))
+    return ScanEvidence(frames, [Commonness.none(len(f.points)) for f in frames], np.ones(len(frames)))
+
+
+def assembly_of(frames, edges, **kwargs) -> Assembly:
     pivots = Pivots(np.stack([f.centroid for f in frames]), np.array([f.radius for f in frames]))
-    return Assembly(scan, pivots, edges, **kwargs)
+    return Assembly(evidence_of(frames), pivots, edges, **kwargs)
 
 
 def assembled(frames, edges, **kwargs):
@@ -84,6 +89,31 @@ def test_two_blocks_with_one_wrong_pair_between_them_stay_apart(frames, degrees)
     assert frames_of(components) == [[0, 1, 2, 3], [4, 5, 6, 7]]
     for component in components:
         assert_right(component)
+
+
+@pytest.mark.parametrize("degrees", [0, 40])
+@pytest.mark.parametrize("factor", [70.0, 300.0])
+def test_a_surface_of_a_giant_holds_nothing_together(frames, factor, degrees):
+    """It hides all that the others saw, and contradicts none of it."""
+    e = wrong(frames, 3, 4, degrees)
+    R, source, target = e.S_target_source.R, frames[3].centroid, frames[4].centroid
+    giant = Similarity(factor, R, target - factor * R @ source)
+    edges = [*right([*FIRST, *SECOND]), replace(e, S_target_source=giant)]
+    assert frames_of(assembled(frames, edges)) == [[0, 1, 2, 3], [4, 5, 6, 7]]
+
+
+@pytest.mark.parametrize("partner", [2, 3, 5])
+def test_frames_agree_as_far_as_their_relative_poses_may_err(frames, partner):
+    """A projector that is off by 1.5 sigma bends and moves its frame's surface by more than its noise."""
+    coords, cloud = images_of(RIG, SIZE)[4].numpy(), clouds_of(RIG, SIZE, noise=0.1)[4]
+    T, off_deg = cloud.pose.T_camera_projector.copy(), 0.5
+    T[:3, :3] = T[:3, :3] @ Rotation.from_euler("y", off_deg, degrees=True).as_matrix()
+    covariance = np.diag([np.radians(off_deg / 1.5) ** 2] * 3 + [1e-8] * 2)
+    pose = replace(cloud.pose, T_camera_projector=T, covariance=covariance)
+    bent = frame_evidence(frame_cloud("bent", coords, camera_of(SIZE), cloud.projector, pose))
+    scan = evidence_of([*frames[:4], bent, *frames[5:]])
+    odds, agreeing, expected = scan.agreement(4, partner, TRUE[partner].inverse() @ TRUE[4])
+    assert odds > LEAST_ODDS and agreeing > 0.95 * expected > 0.5
 
 
 def test_right_pairs_outvote_a_wrong_one_that_seems_better(frames):
