@@ -28,10 +28,8 @@ from sl_nerfstudio.registration.pose_graph import Component, Pivots, optimise_at
 MOST_COMPARED = 12  # clearly different similarities between two components
 MOST_PAIRS = 10  # of frames across two components that are compared
 MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
-BASELINE_SIGMA = (
-    0.5  # of the logarithm of a frame's baseline: who moves two devices keeps their distance to a factor or so
-)
-LARGEST_BASELINE = 10.0  # ratio of two frames' baselines, beyond which a surface has collapsed onto a patch of another
+BASELINE_SIGMA = 0.5  # of the logarithm of a ratio of baselines: nobody moves two devices much farther apart
+LARGEST_BASELINE = 5.0  # such a ratio, beyond which a surface has collapsed onto a patch of another
 LEAST_SIGHT_COSINE = float(np.cos(np.radians(75.0)))  # between lines of sight: beyond it frames share no surface
 
 

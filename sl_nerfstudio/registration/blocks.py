@@ -9,7 +9,7 @@ stays apart.
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,19 +80,18 @@ class BlockReview:
 
     def settled(self) -> Settled:
         """Move blocks to where they are likeliest; take out those whose place is not decided."""
-        turns = self._turns()
+        turns, returned = self._turns(), set[frozenset[int]]()
         for _ in range(MOST_MOVES):
-            cuts = sorted((best_block(t.by_surface + t.by_order, t) for t in turns), key=lambda cut: -cut.gain)
-            likely = (cut for cut in cuts if cut.gain > LEAST_GAIN and self._verified(cut) > LEAST_GAIN)
-            cut = next(likely, None) or self._likeliest_frame(np.ones(len(self.nodes), dtype=bool))
-            if cut is None or cut.gain <= LEAST_GAIN:
+            moves = ((self._frames(cut.block), cut) for cut in self._moves(turns))
+            moved, cut = next(((moved, cut) for moved, cut in moves if moved not in returned), (frozenset[int](), None))
+            if cut is None:
                 break
-            moved = self._frames(cut.block)
             nodes = {k: cut.S_world_world @ S if k in moved else S for k, S in self.nodes.items()}
             there = optimise_known(self._edges, self._pivots, nodes).S_world_camera
             rest = {k: S for k, S in self.nodes.items() if k not in moved}
             if not self._assembly.differ(rest, {k: self.nodes[k] for k in moved}, self.nodes, there):
-                break  # its pairs take it back
+                returned.add(moved)  # its pairs take it back
+                continue
             self.nodes = there
             self._elsewhere.clear()
             turns = self._turns()
@@ -105,6 +104,12 @@ class BlockReview:
             sum(len(block.nodes) for block in without) > len(out),
             _distinct(sorted(block.turn_deg for block in without if block.turn_deg >= LEAST_SIDE_DEG)),
         )
+
+    def _moves(self, turns: Sequence[Turn]) -> Iterator[Cut]:
+        """Blocks that are likelier elsewhere, then single frames."""
+        cuts = sorted((best_block(t.by_surface + t.by_order, t) for t in turns), key=lambda cut: -cut.gain)
+        yield from (cut for cut in cuts if cut.gain > LEAST_GAIN and self._verified(cut) > LEAST_GAIN)
+        yield from (cut for cut in self._single_frames(np.ones(len(self.nodes), dtype=bool)) if cut.gain > LEAST_GAIN)
 
     def _open(self, turns: Sequence[Turn], with_order: bool) -> list[OpenBlock]:
         """Blocks whose place is not decided, one after the other: of two parts the smaller is taken out.
@@ -131,7 +136,7 @@ class BlockReview:
                 for cut in likely
             )
             cut = next((one for one in verified if one.gain > -LEAST_ODDS), None)
-            cut = cut or self._likeliest_frame(inside, with_order, ADJUSTED_DEG)
+            cut = cut or next(iter(self._single_frames(inside, with_order, ADJUSTED_DEG)), None)
             if cut is None or cut.gain <= -LEAST_ODDS:
                 break
             block = cut.block if 2 * cut.block.sum() <= len(left) else inside & ~cut.block
@@ -140,23 +145,19 @@ class BlockReview:
             left = np.flatnonzero(inside & ~block)
         return found
 
-    def _likeliest_frame(
-        self, inside: Bool[ndarray, "n"], with_order: bool = True, from_deg: float = 0.0
-    ) -> Cut | None:
-        """The frame that gains most elsewhere by all others inside, whichever of its pairs says so."""
-        best: Cut | None = None
+    def _single_frames(self, inside: Bool[ndarray, "n"], with_order: bool = True, from_deg: float = 0.0) -> list[Cut]:
+        """What single frames gain elsewhere by all others inside, whichever of their pairs says so; the most first."""
+        found: list[Cut] = []
         rest = {k: S for (k, S), here in zip(self.nodes.items(), inside, strict=True) if here}
         for number, (frame, S) in enumerate(self.nodes.items()):
-            if not inside[number] or len(rest) < 2:
-                continue
-            for place in self._places_of(frame, S, rest):
+            places = self._places_of(frame, S, rest) if inside[number] and len(rest) > 1 else []
+            for place in places:
                 if angle_deg(place.S_world_world.R) < from_deg:
                     continue
-                by_order = with_order and is_another_side(place.S_world_world)
-                gain = place.by_surface + (place.by_order if by_order else 0.0)
-                if best is None or gain > best.gain:
-                    best = Cut(gain, np.arange(len(self.nodes)) == number, place.S_world_world, alike=False)
-        return best
+                by_order = place.by_order if with_order and is_another_side(place.S_world_world) else 0.0
+                block = np.arange(len(self.nodes)) == number
+                found.append(Cut(place.by_surface + by_order, block, place.S_world_world, alike=False))
+        return sorted(found, key=lambda cut: -cut.gain)
 
     def _places_of(self, frame: int, here: Similarity, rest: Component) -> list[Elsewhere]:
         """Other places of a frame; none for one that more frames than these have held already."""
@@ -166,8 +167,8 @@ class BlockReview:
             known = self._elsewhere[frame] = rest, self._assembly.elsewhere(others, frame, here)
         return known[1]
 
-    def _frames(self, block: Bool[ndarray, "n"]) -> set[int]:
-        return set(np.array(list(self.nodes))[block].tolist())
+    def _frames(self, block: Bool[ndarray, "n"]) -> frozenset[int]:
+        return frozenset(np.array(list(self.nodes))[block].tolist())
 
     def _verified(self, cut: Cut, inside: Bool[ndarray, "n"] | None = None, with_order: bool = True) -> float:
         """What a turn gains, in nats, by all frames that face each other across the border, before it or after it."""

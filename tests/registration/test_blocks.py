@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import Assembly, Prior, relative
+from sl_nerfstudio.registration.assembly import Assembly, Prior, by_odds, relative
 from sl_nerfstudio.registration.blocks import BlockReview, Settled, Turn, best_block
 from sl_nerfstudio.registration.evidence import Comparison
 from sl_nerfstudio.registration.pairs import PairMatch, Rival
@@ -53,13 +53,12 @@ class Said(Assembly):
 
     def compare(self, first, second, nodes, alike=False) -> Comparison:
         across = self._between(first, second)
-        odds = np.zeros(len(nodes))
+        lead, odds = np.zeros((2, len(nodes)))
         for k, at in enumerate(nodes):
             known = [e.log_odds_at(relative(at, e.source, e.target)) for e in across]
-            odds[k] = sum(-60.0 if one is None else one for one in known)
-        none = Comparison.none(len(nodes))
-        none.shared[:] = odds[:, None] - odds
-        return none
+            lead[k] = sum(-60.0 if one is None else one for one in known)
+            odds[k] = sum(0.0 if one is None else 100.0 + one for one in known)
+        return replace(Comparison.none(len(nodes)), shared=lead[:, None] - lead, odds=odds)
 
 
 def review(edges: list[PairMatch], start: dict[int, Similarity], prior=None) -> Settled:
@@ -108,9 +107,7 @@ class Seen(Said):
             )
             for at in nodes
         ]
-        none, odds = Comparison.none(len(nodes)), -np.array(off)
-        none.shared[:] = odds[:, None] - odds
-        return none
+        return by_odds(1e4 - np.array(off))
 
 
 def test_a_frame_that_one_pair_holds_at_a_wrong_place_is_put_where_the_others_see_it():

@@ -84,7 +84,7 @@ def any_frame(camera: Device, seed: int, points: int = 400) -> FrameEvidence:
     nothing = EmptyPlaces(rng.random((h, w)) < 0.7, PROJECTOR, T, rng.uniform(2.5, 3.5, (24, 30)))
     return FrameEvidence(
         camera, surface, smooth, nothing, np.concatenate([position, normal, sigma, errors], 1), some,
-        position.mean(0), 1.0, 2.0, 0.05,
+        position.mean(0), 1.0, 2.0, 0.05, 0.1,
     )  # fmt: skip
 
 
@@ -187,6 +187,7 @@ def plane_frame(camera: Device, normal: ndarray, height: float, seed: int) -> Fr
         position.mean(0) + normal,
         1.0,
         1.0,
+        SIGMA,
         SIGMA,
     )
 
@@ -354,6 +355,7 @@ def in_units(frame: FrameEvidence, factor: float) -> FrameEvidence:
     return replace(
         frame, surface=frame.surface * np.float32(factor), smooth=smooth, points=points,
         centroid=factor * frame.centroid, radius=factor * frame.radius, usual_sigma=factor * frame.usual_sigma,
+        depth_sigma=factor * frame.depth_sigma,
         nothing=replace(nothing, T_projector_camera=T, reach=factor * nothing.reach),
     )  # fmt: skip
 
