@@ -179,10 +179,8 @@ class Assembly:
     def _proposed(self, first: Component, second: Component) -> list[Similarity]:
         """The clearly different similarities between two components that pairs across say, the most likely first."""
         links = [link for e in self._between(first, second) for link in self._links(e, first, second)]
-        one, two = (float(np.mean([np.log(S.scale) for S in part.values()])) for part in (first, second))
-        links = [
-            link for link in links if abs(np.log(link.S_first_second.scale) + two - one) < np.log(LARGEST_BASELINE)
-        ]
+        ratio = log_baseline(second) - log_baseline(first)
+        links = [link for link in links if abs(np.log(link.S_first_second.scale) + ratio) < np.log(LARGEST_BASELINE)]
         distinct: list[Similarity] = []
         for link in sorted(links, key=lambda one: -one.log_odds):
             if len(distinct) == MOST_COMPARED:
@@ -209,8 +207,7 @@ class Assembly:
 
     def _known_across(self, first: Component, second: Component, nodes: Component) -> list[PairMatch]:
         """The pairs across two components that know where their frames are."""
-        across = self._between(first, second)
-        return [e for e in across if e.log_odds_at(relative(nodes, e.source, e.target)) is not None]
+        return [e for e in self._between(first, second) if e.knows(nodes)]
 
     @staticmethod
     def _between_worlds(first: Component, second: Component, both: Component) -> Similarity:
@@ -236,7 +233,7 @@ class Assembly:
             here = [relative(at, j, i) if see_same_side(at[i], at[j]) else None for at in nodes]
             found += self._scan.comparison(j, i, here).scaled(2 / (degree[i] + degree[j]))
         found += self._by_tone(first, second, nodes)
-        found += by_odds([self.usual_baselines(first, second, at) for at in nodes])
+        found += by_odds([self._usual_baselines(first, second, at) for at in nodes])
         return replace(found, alike=found.alike | alike)
 
     def _by_tone(self, first: Component, second: Component, nodes: Sequence[Component]) -> Comparison:
@@ -246,14 +243,14 @@ class Assembly:
         odds = np.zeros(len(nodes))
         for e in across:
             for k, at in enumerate(nodes):
-                if e.log_odds_at(relative(at, e.source, e.target)) is not None:
+                if e.knows(at):
                     odds[k] += TONE_ODDS * 2 / (degree[e.source] + degree[e.target])
         return by_odds(odds)
 
     @staticmethod
-    def usual_baselines(first: Component, second: Component, nodes: Component) -> float:
+    def _usual_baselines(first: Component, second: Component, nodes: Component) -> float:
         """Log-odds of the ratio of the baselines of two components: a surface that collapses fits anywhere."""
-        one, two = (float(np.mean([np.log(nodes[k].scale) for k in part])) for part in (first, second))
+        one, two = (log_baseline({k: nodes[k] for k in part}) for part in (first, second))
         return -0.5 * ((one - two) / BASELINE_SIGMA) ** 2
 
     def looks_alike(self, nodes: Component, turn: Similarity) -> bool:
@@ -337,6 +334,11 @@ def by_odds(odds: Sequence[float] | Float64[ndarray, "k"]) -> Comparison:
     """Places compared by log-odds of each."""
     each = np.array(odds, dtype=np.float64)
     return replace(Comparison.none(len(each)), shared=each[:, None] - each, odds=each)
+
+
+def log_baseline(part: Component) -> float:
+    """Mean logarithm of the baselines of some frames, in their world."""
+    return float(np.mean([np.log(S.scale) for S in part.values()]))
 
 
 def relative(nodes: Component, source: int, target: int) -> Similarity:

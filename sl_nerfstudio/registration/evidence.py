@@ -74,11 +74,8 @@ LARGEST_LEAD = 1e6  # nats: of the only place
 
 NEAR_THINNED = 3  # only each so-manieth point is used to find the most likely place close to one
 NEAR_WIDTHS = (10.0, 7.0, 5.0, 4.0)  # of the kernel on the way there, sigmas
-NEAR_DEG, NEAR_SHIFT = (
-    2.0,
-    0.08,
-)  # how far that may be: degrees, radii beside what errors of both relative poses explain
-NEAR_SIGMAS = 3.0  # of these
+NEAR_DEG, NEAR_SHIFT = 2.0, 0.08  # how far that may be: degrees, radii
+NEAR_SIGMAS = 3.0  # and what errors of both relative poses explain
 
 CONTRADICTING_SIGMAS = 3.0  # behind the surface, from which it is asked whether an edge hides a point
 STEEPEST = 5.0  # change of distance from place to place, in their width, beyond which a surface has an edge

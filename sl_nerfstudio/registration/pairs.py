@@ -7,7 +7,7 @@ each frame's baseline has an unknown length, but a free scale would collapse a s
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -181,6 +181,11 @@ class PairMatch:
         R, odds = self._rotations
         near = np.einsum("mij,ij->m", R, S.R) >= 1 + 2 * math.cos(math.radians(SAME_TURN_DEG))
         return float(odds[near].max()) if near.any() else None
+
+    def knows(self, nodes: Mapping[int, Similarity]) -> bool:
+        """Whether both frames are among these nodes, at one of its places to each other."""
+        inside = self.source in nodes and self.target in nodes
+        return inside and self.log_odds_at(nodes[self.target].inverse() @ nodes[self.source]) is not None
 
     def between(self, source: int, target: int) -> Similarity:
         """The similarity from `source` to `target`, whichever way it was found."""

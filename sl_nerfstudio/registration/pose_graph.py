@@ -138,12 +138,7 @@ def optimise_at_places(
 
 def optimise_known(edges: Sequence[PairMatch], pivots: Pivots, start: Mapping[int, Similarity]) -> PoseGraphSolution:
     """The same with frames that are about where they belong: pairs that do not know that place have no say."""
-
-    def knows(e: PairMatch) -> bool:
-        inside = e.source in start and e.target in start
-        return inside and e.log_odds_at(start[e.target].inverse() @ start[e.source]) is not None
-
-    weight = edge_weights(edges) * np.array([knows(e) for e in edges], dtype=np.float64)
+    weight = edge_weights(edges) * np.array([e.knows(start) for e in edges], dtype=np.float64)
     return optimise_pose_graph(at_places(edges, start), pivots, start, weight)
 
 

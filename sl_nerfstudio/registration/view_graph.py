@@ -222,8 +222,8 @@ class ViewGraph:
         Pairs that may slip connect nothing, unless all of them may: then the surface is one of revolution, and its
         frames are put together all the same.
         """
-        self.by_order, self.open, self.turns_deg = False, [], ()
         edges, scan = self.edges, self.evidence()
+        self.by_order, self.open, self.turns_deg = False, [], ()
         assembly = self.assembly([e for e in edges if e.holds], scan)
         components = assembly.grow()
         if len(components[0]) == 1:
