@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import permutations, product
-from math import atan2, factorial, sin, sqrt
+from math import atan2, degrees, factorial, hypot, sin, sqrt
 
 import numpy as np
 import torch
@@ -234,8 +234,9 @@ def axis_words(R: Float64[ndarray, "3 3"]) -> str:
 
 
 def angle_deg(R: Float[ndarray, "3 3"]) -> float:
-    """Angle of a rotation, in degrees."""
-    return float(np.degrees(Rotation.from_matrix(R).magnitude()))
+    """Angle of a rotation, in degrees; accurate for small and large ones."""
+    sine = hypot(R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1])
+    return degrees(atan2(sine, R[0, 0] + R[1, 1] + R[2, 2] - 1.0))
 
 
 def centred_on(points: Float[ndarray, "n 3"], edge_percent: float) -> Similarity:

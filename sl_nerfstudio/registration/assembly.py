@@ -9,6 +9,7 @@ when all are in (see blocks).
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -30,6 +31,8 @@ MOST_PAIRS = 10  # of frames across two components that are compared
 MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
 BASELINE_SIGMA = 0.5  # of the logarithm of a ratio of baselines: nobody moves two devices much farther apart
 LARGEST_BASELINE = 5.0  # such a ratio, beyond which a surface has collapsed onto a patch of another
+NEARLY_SAME_SHIFT = 0.01  # radii, between two places of which evidence is asked only once
+NEARLY_SAME_TRACE = 1 + 2 * np.cos(np.radians(0.5))  # of the rotation between them
 LEAST_SIGHT_COSINE = float(np.cos(np.radians(75.0)))  # between lines of sight: beyond it frames share no surface
 
 
@@ -81,6 +84,7 @@ class Assembly:
         """
         self._scan, self.pivots, self.prior = scan, pivots, prior
         self.edges = sorted(edges, key=lambda e: -e.lead)
+        self._asked: dict[tuple[int, int], list[tuple[tuple[Similarity | None, ...], Comparison]]] = {}
         self._decisions: dict[tuple[int, int], Decision | None] = {}  # by the numbers of two components
         self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(pivots))]
         self._number = list(range(len(pivots)))  # of each frame's component
@@ -142,15 +146,35 @@ class Assembly:
         if not places:
             return None
         nodes = [self.settled(first, second, S) for S in places]
-        found = self.compare(first, second, nodes, self._known_alike(first, second, places))
+        found = self.compare(first, second, nodes)
         usual = np.array([self.usual(first, second, at) for at in nodes])
-        both = found.leads + usual[:, None] - usual
-        best = int(np.argmax(both.min(1)))
+        best, both = self._likeliest(first, second, places, found, usual[:, None] - usual)
         if found.odds[best] < LEAST_ODDS:
             return None
         others = [k for k, at in enumerate(nodes) if k != best and self.differ(first, second, nodes[best], at)]
         S = self._between_worlds(first, second, nodes[best])
-        return Decision(S, float(min(both[best, others], default=found.odds[best])))
+        return Decision(S, float(min(both[others], default=found.odds[best])))
+
+    def _likeliest(
+        self, first: Component, second: Component, places: Sequence[Similarity], found: Comparison,
+        by_order: Float64[ndarray, "k k"],
+    ) -> tuple[int, Float64[ndarray, "k"]]:  # fmt: skip
+        """The place that leads the others, at worst, by most; and by how many nats it leads each.
+
+        Whether the surface looks alike at two places takes long to find out: it is asked of those that the likeliest
+        place leads clearly only if it does not.
+        """
+        alike, asked = found.alike.copy(), np.eye(len(places), dtype=bool)
+        while True:
+            if_not, if_so = (replace(found, alike=a).leads + by_order for a in (alike, np.ones_like(alike)))
+            best = int(np.argmax(if_not.min(1)))
+            matters = (if_not != if_so)[best] & (np.minimum(if_not, if_so)[best] < LEAST_ODDS) & ~asked[best]
+            if not matters.any():
+                return best, if_not[best]
+            for k in np.flatnonzero(matters).tolist():
+                asked[best, k] = asked[k, best] = True
+                alike[best, k] |= self._known_alike(first, second, places[best], places[k])
+                alike[k, best] = alike[best, k]
 
     def elsewhere(self, rest: Component, frame: int, here: Similarity) -> list[Elsewhere]:
         """Clearly different places of one frame of a component that its pairs say, if they may be about as likely.
@@ -165,15 +189,16 @@ class Assembly:
         nodes = [self._placed(rest, frame, S @ here) for S in places]
         found = self.compare(rest, second, nodes)
         usual = [self.usual(rest, second, at) for at in nodes]
-        either = np.maximum(found.leads[:, 0], replace(found, alike=np.ones_like(found.alike)).leads[:, 0])
+        if_not, if_so = (replace(found, alike=np.full_like(found.alike, so)).leads[:, 0] for so in (False, True))
+        either = np.maximum(found.leads[:, 0], if_so)
         out: list[Elsewhere] = []
         for k, S in enumerate(places):
             order = usual[k] - usual[0]
             unlikely = found.odds[k] < LEAST_ODDS or either[k] + max(order, 0) <= -LEAST_ODDS
             if k == 0 or unlikely or not self.differ(rest, second, nodes[0], nodes[k]):
                 continue
-            leads = replace(found, alike=np.full_like(found.alike, self.looks_alike(rest, S))).leads
-            out.append(Elsewhere(S, float(leads[k, 0]), order))
+            alike = if_not[k] != if_so[k] and self.looks_alike(rest, S)
+            out.append(Elsewhere(S, float(if_so[k] if alike else if_not[k]), order))
         return out
 
     def _proposed(self, first: Component, second: Component) -> list[Similarity]:
@@ -231,7 +256,7 @@ class Assembly:
         degree = {k: max(count[k] for count in counts) for k in set().union(*counts)}
         for i, j in sorted(set().union(*near)):
             here = [relative(at, j, i) if see_same_side(at[i], at[j]) else None for at in nodes]
-            found += self._scan.comparison(j, i, here).scaled(2 / (degree[i] + degree[j]))
+            found += self._comparison(j, i, here).scaled(2 / (degree[i] + degree[j]))
         found += self._by_tone(first, second, nodes)
         found += by_odds([self._usual_baselines(first, second, at) for at in nodes])
         return replace(found, alike=found.alike | alike)
@@ -263,14 +288,30 @@ class Assembly:
             return False
         said = 0.0
         for i, j in facing_after(nodes, turn):
-            here = relative(nodes, j, i)
-            found = self._scan.comparison(j, i, [here, nodes[i].inverse() @ turn @ nodes[j]])
+            found = self._comparison(j, i, [relative(nodes, j, i), nodes[i].inverse() @ turn @ nodes[j]])
             if found.alike[0, 1]:
                 said += LEAST_ODDS
             else:
                 contradicted = replace(found, alike=np.ones((2, 2), dtype=bool)).leads[0, 1]
                 said -= min(abs(float(contradicted)), MOST_AGAINST)
         return said > 0
+
+    def _comparison(self, source: int, target: int, places: Sequence[Similarity | None]) -> Comparison:
+        """Compare places of two frames; as before where nearly the same were compared: evidence looks around each."""
+        asked = self._asked.setdefault((source, target), [])
+        for before, found in asked:
+            if len(before) == len(places) and all(map(partial(self._nearly_same, source), before, places)):
+                return found
+        asked.append((tuple(places), self._scan.comparison(source, target, places)))
+        return asked[-1][1]
+
+    def _nearly_same(self, frame: int, a: Similarity | None, b: Similarity | None) -> bool:
+        """Whether two similarities put a frame at nearly the same place."""
+        if a is None or b is None:
+            return a is b
+        centre, radius = self.pivots.centre[frame][None], a.scale * self.pivots.radius[frame]
+        shift = max(np.linalg.norm(a.points(centre) - b.points(centre)) / radius, abs(np.log(a.scale / b.scale)))
+        return bool(shift < NEARLY_SAME_SHIFT and (a.R * b.R).sum() > NEARLY_SAME_TRACE)
 
     @staticmethod
     def _fits_as_well(e: PairMatch, nodes: Component, turn: Similarity) -> bool:
@@ -281,15 +322,9 @@ class Assembly:
         there = e.log_odds_at(nodes[e.target].inverse() @ turn @ nodes[e.source])
         return here is not None and there is not None and abs(here - there) < LEAST_ODDS
 
-    def _known_alike(self, first: Component, second: Component, places: Sequence[Similarity]) -> Bool[ndarray, "k k"]:
-        """Between which places the frames of one of the components are known to look the same."""
-        out = np.zeros((len(places), len(places)), dtype=bool)
-        for k, S in enumerate(places):
-            for m, other in enumerate(places[:k]):
-                out[k, m] = out[m, k] = self.looks_alike(first, S @ other.inverse()) or self.looks_alike(
-                    second, S.inverse() @ other
-                )
-        return out
+    def _known_alike(self, first: Component, second: Component, place: Similarity, other: Similarity) -> bool:
+        """Whether the frames of one of the components are known to look the same at two places."""
+        return self.looks_alike(first, place @ other.inverse()) or self.looks_alike(second, place.inverse() @ other)
 
     def differ(self, first: Component, second: Component, a: Component, b: Component) -> bool:
         """Whether two components are at clearly different places, to each other, in two worlds."""

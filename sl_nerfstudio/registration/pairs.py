@@ -166,7 +166,7 @@ class PairMatch:
         """Whether tones hold the frames where surfaces alone would let them slip."""
         return self.by_shape is not None
 
-    @property
+    @cached_property
     def places(self) -> tuple[Rival, ...]:
         """Its place and the rivals: all with their log-odds against it."""
         return Rival(self.S_target_source, 0.0), *self.rivals
@@ -181,6 +181,10 @@ class PairMatch:
         R, odds = self._rotations
         near = np.einsum("mij,ij->m", R, S.R) >= 1 + 2 * math.cos(math.radians(SAME_TURN_DEG))
         return float(odds[near].max()) if near.any() else None
+
+    def nearest(self, S: Similarity) -> Similarity:
+        """The place with the rotation nearest to that of a similarity."""
+        return self.places[int(np.argmax(np.einsum("mij,ij->m", self._rotations[0], S.R)))].S_target_source
 
     def knows(self, nodes: Mapping[int, Similarity]) -> bool:
         """Whether both frames are among these nodes, at one of its places to each other."""

@@ -15,7 +15,7 @@ from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
-from sl_nerfstudio.geometry.lie import Similarities, Similarity, angle_deg, exps_at, logs_at
+from sl_nerfstudio.geometry.lie import Similarities, Similarity, exps_at, logs_at
 from sl_nerfstudio.geometry.numerics import geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.registration.pairs import PairMatch, edge_weights
 
@@ -89,8 +89,7 @@ def at_places(edges: Sequence[PairMatch], nodes: Mapping[int, Similarity]) -> li
     out: list[PairMatch] = []
     for e in edges:
         if e.rivals and e.source in nodes and e.target in nodes:
-            here = nodes[e.target].inverse() @ nodes[e.source]
-            nearest = min((one.S_target_source for one in e.places), key=lambda S: angle_deg(S.R @ here.R.T))
+            nearest = e.nearest(nodes[e.target].inverse() @ nodes[e.source])
             out.append(e if nearest is e.S_target_source else replace(e, S_target_source=nearest))
         else:
             out.append(e)
