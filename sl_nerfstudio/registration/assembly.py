@@ -80,7 +80,7 @@ class Assembly:
             scan: compares frames.
             pivots: of every frame, for the pose graph.
             edges: pairs that say where components may belong.
-            prior: log-odds, in nats, of the place of a frame on another by the order of capture.
+            prior: log-odds, in nats, of the place of two frames by the order of capture: of `S_i_j` for frames i and j.
         """
         self._scan, self.pivots, self.prior = scan, pivots, prior
         self.edges = sorted(edges, key=lambda e: -e.lead)

@@ -24,7 +24,7 @@ from sl_nerfstudio.registration.pose_graph import Component, optimise_at_places,
 MOST_TURNS = 48  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
 LEAST_GAIN = 1.0  # nats by which a block must fit better elsewhere to be moved
-LEAST_SIDE_DEG = 20.0  # between two sides of an object
+LEAST_SIDE_DEG = 12.0  # between two sides of an object, or teeth of a gear; closer places are slides along a surface
 ADJUSTED_DEG = 6.0  # between two places, up to which the joint adjustment leads from one to the other
 STARTS = 24  # frames from which a block is grown
 
@@ -160,9 +160,9 @@ class BlockReview:
         return sorted(found, key=lambda cut: -cut.gain)
 
     def _places_of(self, frame: int, here: Similarity, rest: Component) -> list[Elsewhere]:
-        """Other places of a frame; none for one that more frames than these have held already."""
+        """Other places of a frame among the others; asked again when some of these are out."""
         known = self._elsewhere.get(frame)
-        if known is None or (known[1] and len(known[0]) != len(rest)):
+        if known is None or len(known[0]) != len(rest):
             others = {k: S for k, S in rest.items() if k != frame}
             known = self._elsewhere[frame] = rest, self._assembly.elsewhere(others, frame, here)
         return known[1]
@@ -198,7 +198,7 @@ class BlockReview:
         if self._prior is not None:
             for j, S in self.nodes.items():
                 back = S.inverse()
-                usual = ((i, self._prior(i, j, back @ S_i)) for i, S_i in self.nodes.items() if i != j)
+                usual = ((i, self._prior(j, i, back @ S_i)) for i, S_i in self.nodes.items() if i != j)
                 ordered += [(i, j, back, odds) for i, odds in usual if odds]
         return [self._turn(S, column, pairs, ordered) for S in turns_said(self._edges, self.nodes)]
 
@@ -221,7 +221,7 @@ class BlockReview:
                     surface[moved, kept] += weight * (after - before)
         if self._prior is not None:
             for i, j, back, usual in ordered:
-                order[column[i], column[j]] = self._prior(i, j, back @ turn @ self.nodes[i]) - usual
+                order[column[i], column[j]] = self._prior(j, i, back @ turn @ self.nodes[i]) - usual
         return Turn(turn, alike, surface, order)
 
 

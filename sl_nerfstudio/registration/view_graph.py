@@ -1,16 +1,16 @@
 """The view graph: which pairs of frames have been registered with each other, and which to try next."""
 
-import math
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.parallel import tracked
@@ -49,11 +49,13 @@ BRIDGES = 8  # pairs of frames across two components that are registered in orde
 BRIDGES_COMPARED = 40  # pairs across of which those that look most alike are chosen
 BRIDGES_NEARBY = 3  # how many of the bridges are pairs taken one soon after the other
 LEAST_STEPS = 0.5  # share of the successive frames that must fit each other, and turn by the usual step, for one
-LEAST_STEP_DEG = 2.0  # of successive frames
-STEPS_DEG = np.geomspace(1.0, 100.0, 60)  # that are compared
+LEAST_STEP_DEG = 2.0  # spread of the turns of successive frames
+LEAST_SPREAD = 0.3  # the same, relative to the usual turn
+SPREAD_COUNT = 4.0  # turns that this spread counts as
 LARGEST_STEP_DEG = 40.0  # of someone who walks around an object
-UNUSUAL_DENSITY = 1 / 180  # of a turn that is not the usual one, per degree
-LEAST_SPREAD = 0.3  # of the usual step, relative to it
+NO_ORDER_DEG = 25.0  # spread of the turns of frames in no order that see a common surface
+SMALL_STEP_DEG = 10.0  # of steps that surfaces allow alike smaller ones are likelier: scale of their distribution
+STEP_STARTS, STEP_ROUNDS = 80, 12  # of the search for the usual step
 LARGEST_GAP = 2  # between frames by which the usual step is learnt
 MOST_BY_ORDER = 25.0  # nats against a place by the order: someone may have walked to the other side
 LEAST_DISTANCE = 0.2  # of a camera from the object, relative to the median, for its rough pose to be used
@@ -134,10 +136,33 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True)
 class UsualStep:
-    """The angle by which cameras of successive frames usually turn, and its standard deviation, degrees."""
+    """How the camera usually turns from one frame to the next: someone walks around an object one way."""
 
-    deg: float
-    sigma_deg: float
+    mean_deg: Float64[ndarray, "3"]  # rotation vector in the earlier camera's axes
+    covariance: Float64[ndarray, "3 3"]  # square degrees
+
+    @property
+    def deg(self) -> float:
+        """Angle of the usual turn."""
+        return float(np.linalg.norm(self.mean_deg))
+
+    @property
+    def rms_deg(self) -> float:
+        """Root mean square of the turns' angles."""
+        return float(np.hypot(self.deg, np.sqrt(np.trace(self.covariance))))
+
+    def log_density(self, turn_deg: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n"]:
+        """Of rotation vectors."""
+        size = float(np.linalg.slogdet(2 * np.pi * self.covariance)[1])
+        return -0.5 * (self.squared_sigmas(turn_deg) + size)
+
+    def squared_sigmas(self, turn_deg: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n"]:
+        """How far rotation vectors are from the usual one."""
+        d = turn_deg - self.mean_deg
+        return np.einsum("ni,ni->n", d, np.linalg.solve(self.covariance, d.T).T)
+
+
+NO_ORDER = UsualStep(np.zeros(3), NO_ORDER_DEG**2 * np.eye(3))
 
 
 class ViewGraph:
@@ -229,13 +254,17 @@ class ViewGraph:
         if len(components[0]) == 1:
             return self.assembly(edges, scan).grow()
         found, turns = list[Component](), set[float]()
-        for component in components:
+        left: list[tuple[Component, OpenBlock | None]] = [(component, None) for component in components]
+        while left:
+            component, block = left.pop(0)
             if len(component) == 1:
                 found.append(component)
+                self.open += [] if block is None else [block]
                 continue
             one = BlockReview(assembly, component).settled()
-            found += [one.decided, *(block.nodes for block in one.open)]
-            self.open += one.open
+            found.append(one.decided)
+            self.open += [] if block is None else [replace(block, nodes=one.decided)]
+            left += [(inner.nodes, inner) for inner in one.open]  # what holds together inside is not known yet
             turns |= set(one.turns_deg)
             self.by_order |= one.by_order
         self.turns_deg = tuple(sorted(turns))
@@ -257,26 +286,25 @@ class ViewGraph:
         return ScanEvidence(frames, common, np.array([np.median(each) if each else 1.0 for each in noise]))
 
     def learn_step(self) -> None:
-        """By how much successive frames usually turn: what makes the places that all their pairs allow most likely.
+        """How the camera usually turns between successive frames, if it does: what makes their pairs' places likeliest.
 
-        Large turns are those of frames in no order.
+        None if frames in no order turn as much, or by as much.
         """
+        self.step = None
         pairs = [e for e in self.edges if abs(e.target - e.source) <= LARGEST_GAP and e.holds]
         if sum(abs(e.target - e.source) == 1 for e in pairs) <= LEAST_STEPS * (len(self.frames) - 1):
-            self.step = None
             return
-        steps = [UsualStep(deg, max(LEAST_SPREAD * deg, LEAST_STEP_DEG)) for deg in STEPS_DEG]
-        step = max(steps, key=lambda step: sum(math.log(sum(_densities(e, step))) for e in pairs))
-        usual = [_densities(e, step) for e in pairs]
-        share = np.mean([known / (known + unusual) for known, unusual in usual])
-        self.step = step if step.deg <= LARGEST_STEP_DEG and share >= LEAST_STEPS else None
+        turns = Turns.of(pairs)
+        step = likeliest_step(turns)
+        if step.rms_deg <= LARGEST_STEP_DEG and turns.probability(step).mean() >= LEAST_STEPS:
+            self.step = step
 
     def usual_step(self, i: int, j: int, S_i_j: Similarity) -> float:
         """Log-odds of the place of one frame on another by the order of capture."""
         if self.step is None or abs(i - j) > 1:
             return 0.0
-        off = (angle_deg(S_i_j.R) - self.step.deg) / self.step.sigma_deg
-        return -min(0.5 * off**2, MOST_BY_ORDER)
+        turn = turn_deg(S_i_j if j > i else S_i_j.inverse())
+        return -min(0.5 * float(self.step.squared_sigmas(turn[None])[0]), MOST_BY_ORDER)
 
     def solve(self, component: Component) -> PoseGraphSolution:
         """A component with the pairs that hold it optimised together, each where its frames are."""
@@ -337,14 +365,71 @@ class ViewGraph:
         return sorted(pairs - edges)
 
 
-def _densities(e: PairMatch, step: UsualStep) -> tuple[float, float]:
-    """Of the turn of a pair, over the places that it allows: by the usual step, and of a turn by anything."""
-    angle = np.array([angle_deg(one.S_target_source.R) for one in e.places])
-    odds = np.array([one.log_odds for one in e.places])
-    odds = np.exp(odds - odds.max())
-    off = (angle / abs(e.target - e.source) - step.deg) / step.sigma_deg
-    usual = np.exp(-0.5 * off**2) / (step.sigma_deg * math.sqrt(2 * math.pi))
-    return float((usual * odds).sum() / odds.sum()), UNUSUAL_DENSITY
+def turn_deg(S_earlier_later: Similarity) -> Float64[ndarray, "3"]:
+    """Rotation vector from one camera to a later one."""
+    return np.asarray(np.degrees(Rotation.from_matrix(S_earlier_later.R).as_rotvec()))
+
+
+@dataclass(frozen=True)
+class Turns:
+    """By how much cameras of pairs turn from one frame to the next, at all places that the pairs allow."""
+
+    turn_deg: Float64[ndarray, "n 3"]
+    weight: Float64[ndarray, "n"]  # share of the place among those of its pair
+    pair: Int64[ndarray, "n"]
+
+    @staticmethod
+    def of(pairs: Sequence[PairMatch]) -> "Turns":
+        """Stack the places of pairs."""
+        turn, weight, number = list[Float64[ndarray, "3"]](), list[Float64[ndarray, "m"]](), list[int]()
+        for k, e in enumerate(pairs):
+            odds = np.array([one.log_odds for one in e.places])
+            weight.append(np.exp(odds - odds.max()) / np.exp(odds - odds.max()).sum())
+            number += [k] * len(odds)
+            for one in e.places:
+                S = one.S_target_source.inverse() if e.target > e.source else one.S_target_source
+                turn.append(turn_deg(S) / abs(e.target - e.source))
+        return Turns(np.stack(turn), np.concatenate(weight), np.array(number, dtype=np.int64))
+
+    def log_likelihood(self, step: UsualStep) -> Float64[ndarray, "pairs"]:
+        """Of the turn of each pair."""
+        return np.log(np.bincount(self.pair, self.weight * np.exp(step.log_density(self.turn_deg))) + 1e-300)
+
+    def probability(self, step: UsualStep) -> Float64[ndarray, "pairs"]:
+        """That each pair turned by the usual step, and not as frames in no order do."""
+        return 1 / (1 + np.exp(np.clip(self.log_likelihood(NO_ORDER) - self.log_likelihood(step), -50, 50)))
+
+    def places(self, step: UsualStep) -> Float64[ndarray, "n"]:
+        """Probability that each place is the right one and its pair turned by the usual step."""
+        each, none = (self.weight * np.exp(one.log_density(self.turn_deg)) for one in (step, NO_ORDER))
+        total = np.bincount(self.pair, each + none)
+        return each / total[self.pair]
+
+
+def likeliest_step(turns: Turns) -> UsualStep:
+    """The normal distribution of turns that makes those of all pairs likeliest (EM: Dempster et al., 1977)."""
+    likely = np.flatnonzero(np.linalg.norm(turns.turn_deg, axis=1) <= LARGEST_STEP_DEG)
+    likely = likely[np.argsort(-turns.weight[likely], kind="stable")[:STEP_STARTS]]
+    best, most = NO_ORDER, -np.inf
+    for mean in (np.zeros(3), *turns.turn_deg[likely]):
+        step = UsualStep(mean, (NO_ORDER_DEG**2 if not mean.any() else spread_deg(mean) ** 2) * np.eye(3))
+        for _ in range(STEP_ROUNDS):
+            w = turns.places(step)
+            total = w.sum() + 1e-9
+            mean = w @ turns.turn_deg / total
+            d = turns.turn_deg - mean
+            spread = spread_deg(mean) ** 2 * np.eye(3)
+            step = UsualStep(mean, ((w[:, None] * d).T @ d + SPREAD_COUNT * spread) / (total + SPREAD_COUNT))
+        both = np.logaddexp(turns.log_likelihood(step), turns.log_likelihood(NO_ORDER))
+        found = float(both.sum()) - step.deg / SMALL_STEP_DEG
+        if found > most:
+            best, most = step, found
+    return best
+
+
+def spread_deg(mean_deg: Float64[ndarray, "3"]) -> float:
+    """Spread of turns that is expected before they are known."""
+    return max(LEAST_SPREAD * float(np.linalg.norm(mean_deg)), LEAST_STEP_DEG)
 
 
 def likely_places(match: PairMatch) -> list[Similarity]:
