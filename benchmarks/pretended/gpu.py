@@ -16,6 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from torch.utils._pytree import tree_leaves, tree_map
 
 from sl_nerfstudio.field import device_kernels
+from sl_nerfstudio.parallel import gpu_fault, gpu_found
 
 CUDA = torch.device("cuda:0")
 
@@ -196,6 +197,9 @@ class PretendedGpu(TorchDispatchMode):
         ]  # fmt: skip
         replaced.append((device_kernels, "run", self._run_kernel))
         replaced.append((device_kernels, "_tried", lambda _: None if self._kernels else "a pretended GPU runs nothing"))
+        for found in (gpu_found, gpu_fault):  # before and after it, something else is found
+            found.cache_clear()
+            self._stack.callback(found.cache_clear)
         for owner, name, stand_in in replaced:
             self._stack.enter_context(mock.patch.object(owner, name, stand_in))
         self._stack.enter_context(torch.autograd.set_multithreading_enabled(False))
