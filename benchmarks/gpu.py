@@ -4,11 +4,12 @@
 
 In order of value: the kernels against double precision; times of a step and of the loop around it, waits and memory, of
 both methods with every backend, with and without a CUDA graph; recording beside a thread that uses the GPU; new
-recordings while levels are switched on; whole trainings, with their surfaces against the truth, and against the same
-training on the CPU; the same step with nerfstudio's own encoding. A part that fails is written down with its error, and
-the next one begins; what there is no time for is left out by name; the file is written after each part. With `--device
-cpu` all of it runs without a GPU, except for what needs one. Without open3d, `--scan` is needed (one with its truth),
-and distances are those of the true surface's points from the field's zero, by its values and slopes.
+recordings while levels are switched on; a training that goes on from its checkpoint against one in one go; whole
+trainings, with their surfaces against the truth, and against the same training on the CPU; the same step with
+nerfstudio's own encoding. A part that fails is written down with its error, and the next one begins; what there is no
+time for is left out by name; the file is written after each part. With `--device cpu` all of it runs without a GPU,
+except for what needs one. Without open3d, `--scan` is needed (one with its truth), and distances are those of the true
+surface's points from the field's zero, by its values and slopes.
 """
 
 import copy
@@ -36,6 +37,7 @@ from sl_nerfstudio.errors import first_line
 from sl_nerfstudio.field.backend import BackendName
 from sl_nerfstudio.field.field import FieldConfig, SDFField
 from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.model.run_files import checkpoints_in
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan.write import read_ground_truth
 
@@ -93,6 +95,8 @@ def parts(config: Config, scan: Path) -> dict[str, Callable[[], dict[str, Any]]]
     if there == "cuda":
         found["beside a busy thread"] = partial(beside_a_busy_thread, config, scan)
         found["new recordings"] = partial(new_recordings, config, scan)
+    for size in METHODS:
+        found[f"resume {size}"] = partial(resumed, config, scan, size)
     for device in dict.fromkeys((there, "cpu")):
         found[f"surface paper {device}"] = partial(surface, config, scan, "paper", device, config.compared_steps)
         found[f"surface default {device}"] = partial(surface, config, scan, "default", device, config.default_steps)
@@ -120,10 +124,19 @@ def encodings(device: str) -> dict[str, Callable[..., Ours | Theirs]]:
     return found
 
 
-def begun(scan: Path, size: str, device: str, steps: int, backend: BackendName, graph: bool, adjust: bool) -> Training:
-    """A training whose run folder is forgotten."""
+def begun(
+    scan: Path,
+    size: str,
+    device: str,
+    steps: int,
+    backend: BackendName,
+    graph: bool,
+    adjust: bool,
+    checkpoint: Path | None = None,
+) -> Training:
+    """A training whose run folder is forgotten; with a checkpoint it goes on from there."""
     run = settings(METHODS[size], scan, Path(tempfile.mkdtemp()), device, steps)
-    run.cuda_graph = graph
+    run.cuda_graph, run.load_checkpoint = graph, checkpoint
     model_of(run).sdf.backend = backend
     torch.manual_seed(0)
     return Training(run, adjust)
@@ -225,6 +238,34 @@ def new_recordings(config: Config, scan: Path) -> dict[str, Any]:
         if time.perf_counter() - begin > 0.02:
             slow.append((step, round(time.perf_counter() - begin, 3)))
     return {"slow_steps": slow, "graph": training.trainer.recorded is not None, **_memory(config.device)}
+
+
+def resumed(config: Config, scan: Path, size: str) -> dict[str, Any]:
+    """Greatest difference of weights after N steps, a checkpoint and N more from 2 N steps, over the greatest weight.
+
+    And that of 2 N steps from the same again: on a GPU sums are in no fixed order.
+    """
+    steps = config.steps
+
+    def taken(training: Training, until: int) -> Training:
+        while training.done < until:
+            training.step()
+            training.after()
+        return training
+
+    begin = partial(begun, scan, size, config.device, 2 * steps, "auto", True, False)
+    half = taken(begin(), steps)
+    half.trainer.save_checkpoint(steps - 1)
+    again = begin(checkpoint=checkpoints_in(half.trainer.checkpoint_dir)[-1])
+    again.done = steps
+    wanted = taken(begin(), 2 * steps)
+    others = {"resumed": taken(again, 2 * steps), "in_one_go": taken(begin(), 2 * steps)}
+    return {"steps": steps, **{name: _difference(wanted.model, other.model) for name, other in others.items()}}
+
+
+def _difference(one: torch.nn.Module, other: torch.nn.Module) -> float:
+    pairs = [x for x in zip(one.parameters(), other.parameters(), strict=True) if x[0].numel()]
+    return float(f"{max(float((a - b).abs().max() / a.abs().max().clamp_min(1e-30)) for a, b in pairs):.1e}")
 
 
 def encoding_times(config: Config, make: Callable[[], Ours | Theirs]) -> dict[str, Any]:

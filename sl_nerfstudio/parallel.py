@@ -1,4 +1,4 @@
-"""What this process may use of the machine, and work on many pieces side by side on all threads."""
+"""What this process may use of the machine, its GPU too, and work on many pieces side by side on all threads."""
 
 import ctypes
 import fcntl
@@ -6,23 +6,28 @@ import inspect
 import itertools
 import math
 import mmap
+import multiprocessing
 import os
+import signal
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from functools import cache, lru_cache, partial
 from itertools import product
+from multiprocessing import connection, resource_tracker
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numba
 import torch
 from threadpoolctl import threadpool_limits
 
 from sl_nerfstudio.console import track
+from sl_nerfstudio.errors import UserError, first_line
 
 # What this process may use: as its affinity mask and its control groups (cgroups(7)) allow. joblib counts cores by the
 # outermost group alone, and knows nothing of the limit of the memory.
@@ -64,6 +69,82 @@ def _group_limits(controller: str, *files: tuple[str, ...]) -> Iterator[list[str
         for folder, several in product(inside[: inside.index(mount) + 1], files):
             with suppress(OSError):  # no such group
                 yield [word for name in several for word in (folder / name).read_text().split()]
+
+
+# The GPU, if there is one that works: a driver that is too old for torch, or a GPU that torch's kernels do not know, is
+# a sentence and no traceback.
+
+DeviceName = Literal["cuda", "cpu"]
+
+
+@cache
+def gpu_found() -> tuple[bool, str]:
+    """Whether torch finds a GPU; if it does not although it looked for one, why."""
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = torch.cuda.is_available()
+    return found, "" if found or not said else first_line(UserWarning(said[-1].message))
+
+
+@cache
+def gpu_fault() -> str:
+    """Why the GPU cannot be used, "" if it computes."""
+    found, why = gpu_found()
+    if not found:
+        return why or f"torch {torch.__version__} finds none"
+    try:
+        right = float((torch.ones(2, device="cuda") * 2).sum()) == 4.0
+    except Exception as error:  # whatever a driver or a library does
+        return first_line(error)
+    return "" if right else "it computes something else than the CPU"
+
+
+def usable_device(asked: DeviceName | None) -> tuple[DeviceName, str]:
+    """The device that is asked for, by default the GPU if it works, else the CPU; and a sentence, if a GPU fails.
+
+    Raises UserError for a GPU that is asked for and cannot be used.
+    """
+    if asked == "cpu" or (asked is None and gpu_found() == (False, "")):
+        return "cpu", ""
+    fault = gpu_fault()
+    if not fault:
+        return "cuda", ""
+    if asked is None:
+        return "cpu", f"The GPU is not used: {fault}."
+    raise UserError(
+        f"--device cuda: the GPU cannot be used: {fault}\n"
+        "    cause:  there is none, its driver is too old, or torch has no kernels for it\n"
+        "    remedy: leave --device out; python -m sl_nerfstudio says what was found"
+    )
+
+
+# Processes that end with their parent, whatever ends it, and leave control-C to it.
+
+_EXIT_ORPHANED = 1
+
+
+def end_with_parent() -> None:
+    """From now on, this process ends when its parent does."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """Wait for the end of the parent: the pipe to it, which only it holds, is then closed by the kernel."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(_EXIT_ORPHANED)
+
+
+@contextmanager
+def no_interrupts() -> Iterator[None]:
+    """Processes started in the block never see control-C: the terminal sends it to them, too, and each would print."""
+    resource_tracker.ensure_running()  # when it starts by itself, it lets signals through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 # Freed memory is kept for the next array instead of being returned to the system.

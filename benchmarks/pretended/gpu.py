@@ -16,6 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode, _disable_current_mod
 from torch.utils._pytree import tree_leaves, tree_map
 
 from sl_nerfstudio.field import device_kernels
+from sl_nerfstudio.parallel import gpu_fault, gpu_found
 
 CUDA = torch.device("cuda:0")
 
@@ -140,6 +141,19 @@ class MixedDevicesError(RuntimeError):
     """An operation got tensors of two devices, which CUDA refuses."""
 
 
+class Stream:
+    """Copies on any other stream than the usual one are made as late as a GPU may make them: when it is waited for."""
+
+    def __init__(self) -> None:
+        self.queued: list[Callable[[], Any]] = []
+
+    def wait_stream(self, other: "Stream") -> None:
+        """Let what comes next on this stream see what the other one has done."""
+        for copy in other.queued:
+            copy()
+        other.queued.clear()
+
+
 @dataclass
 class Seen:
     """What a GPU would have done."""
@@ -168,6 +182,7 @@ class PretendedGpu(TorchDispatchMode):
         self.works_there = False  # in an operation on the GPU, whose parts torch makes where it believes to be
         self.calls_factory = False  # for our own code, which says where
         self._stack = ExitStack()
+        self._stream = self._usual_stream = Stream()
 
     def __enter__(self) -> "PretendedGpu":
         """Torch says that there is a GPU."""
@@ -175,11 +190,16 @@ class PretendedGpu(TorchDispatchMode):
             (torch.cuda, "is_available", lambda: True), (torch.cuda, "device_count", lambda: 1),
             (torch.cuda, "mem_get_info", lambda *_: (8 << 30, 8 << 30)),
             (torch.cuda, "is_current_stream_capturing", lambda: False), (torch, "Generator", _Generator),
+            (torch.cuda, "Stream", lambda *_: Stream()), (torch.cuda, "stream", self._on_stream),
+            (torch.cuda, "current_stream", lambda *_: self._stream),
             (torch._C, "_group_tensors_by_device_and_dtype", _grouped(torch._C._group_tensors_by_device_and_dtype)),
             (torch.autograd, "_engine_run_backward", self._backward(torch.autograd._engine_run_backward)),
         ]  # fmt: skip
         replaced.append((device_kernels, "run", self._run_kernel))
         replaced.append((device_kernels, "_tried", lambda _: None if self._kernels else "a pretended GPU runs nothing"))
+        for found in (gpu_found, gpu_fault):  # before and after it, something else is found
+            found.cache_clear()
+            self._stack.callback(found.cache_clear)
         for owner, name, stand_in in replaced:
             self._stack.enter_context(mock.patch.object(owner, name, stand_in))
         self._stack.enter_context(torch.autograd.set_multithreading_enabled(False))
@@ -220,6 +240,14 @@ class PretendedGpu(TorchDispatchMode):
         finally:
             self.works_there = before
 
+    @contextmanager
+    def _on_stream(self, stream: "Stream") -> Iterator[None]:
+        before, self._stream = self._stream, stream
+        try:
+            yield
+        finally:
+            self._stream = before
+
     def _run_kernel(
         self, kernel: Any, grid: tuple[int, ...], arguments: tuple[Any, ...], constants: dict[str, Any]
     ) -> None:
@@ -245,6 +273,11 @@ class PretendedGpu(TorchDispatchMode):
         kwargs = kwargs or {}
         tensors = [x for x in tree_leaves((args, kwargs)) if isinstance(x, Tensor)]
         there = sum(isinstance(x, DeviceTensor) for x in tensors)
+        if there and self._stream is not self._usual_stream and name_of(func) == "copy_":
+            self._check(func, args, tensors)
+            self._stream.queued.append(partial(func, *tree_map(on_cpu, args), **kwargs))
+            self.seen.launches["copy_"] += 1
+            return args[0]
         out = func(*tree_map(on_cpu, args), **tree_map(on_cpu, kwargs))
         if there == 0:
             made = self.works_there and not self.calls_factory and name_of(func) in _FACTORIES

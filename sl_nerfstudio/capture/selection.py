@@ -10,6 +10,7 @@ from numpy import ndarray
 from scipy.ndimage import maximum_filter
 
 from sl_nerfstudio.decoding.grid_detection import LEAST_NODES, GridDetector, edge_width, line_blur
+from sl_nerfstudio.decoding.grid_networks import LoadedNetworks
 from sl_nerfstudio.decoding.grid_phases import clear_places, to_pixel_coordinates
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.images import as_grey
@@ -91,7 +92,7 @@ class GridReader:
 
     def __init__(self, pattern: GridPattern) -> None:
         self.pattern = pattern
-        self._detector = GridDetector(pattern)
+        self._detector = GridDetector(pattern, LoadedNetworks().unet)
 
     def read(self, image: UInt8[ndarray, "h w *c"]) -> GridView:
         """The nodes in an image, grey or RGB; none if it does not show the pattern."""

@@ -61,6 +61,8 @@ class ExportConfig:
     """Keep only the connected piece of the surface with the largest area."""
     data: Path | None = None
     """Scan folder, if it was moved since the training."""
+    device: Literal["cuda", "cpu"] | None = None
+    """Where the field is evaluated; default: on the GPU if there is one that works."""
     overwrite: bool = False
     """Replace existing files."""
 
@@ -117,7 +119,7 @@ _GROUPS = {
     "the surface": ("resolution", "object_only", "largest_component", "keep_unobserved", "fill_holes", "watertight"),
     "for other programs": ("align", "target_faces", "texture", "points", "cameras", "trajectory"),
     "poses": ("poses",),
-    "files": ("data", "overwrite"),
+    "this run": ("data", "device", "overwrite"),
 }
 
 
@@ -529,7 +531,7 @@ def export(config: ExportConfig) -> None:
             held.enter_context(locked(config.pose_folder))
         check_outputs(config)  # again: a process that held them until now may have written them
         with phase("load"):
-            trained = load_run(config.load_config, config.data)
+            trained = load_run(config.load_config, config.data, config.device)
         with phase("export"):
             exported = export_trained(trained, config)
     print(summary(config, trained.model.scan, exported))

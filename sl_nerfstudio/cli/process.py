@@ -26,7 +26,7 @@ _GROUPS = {
     "captures": ("decoder", "sequence", "cell", "unordered", "not_mosaic", "full_size"),
     "lengths and poses": ("known_length", "poses", "no_adjust"),
     "what is used of the pictures": ("masks", "object_only", "color"),
-    "this run": ("work", "jobs", "seed"),
+    "this run": ("work", "jobs", "device", "seed"),
 }
 
 

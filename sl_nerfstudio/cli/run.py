@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
+    from sl_nerfstudio.parallel import DeviceName
     from sl_nerfstudio.runs.run import TrainedRun
 
 EXIT_FAULT = 1
@@ -75,10 +76,16 @@ def _ignore_more_signals() -> None:
             signal.signal(number, signal.SIG_IGN)
 
 
-def load_run(config: Path, data: Path | None) -> "TrainedRun":
+def load_run(config: Path, data: Path | None, device: "DeviceName | None" = None) -> "TrainedRun":
     """`runs.run.load_run`; nerfstudio is imported for it without torch's compiler, which takes seconds."""
+    from sl_nerfstudio.console import paragraph
     from sl_nerfstudio.late_imports import compiler_on_demand
 
     with compiler_on_demand():
         from sl_nerfstudio.runs import run as runs
-    return runs.load_run(config, data)
+    from sl_nerfstudio.parallel import usable_device
+
+    where, sentence = usable_device(device)
+    if sentence:
+        print(paragraph("gpu", sentence), flush=True)
+    return runs.load_run(config, data, where)

@@ -112,15 +112,11 @@ class SLPixelSampler:
         self._seed = torch.initial_seed() + int(held_out)
         self._step: int | None = None
 
-    def set_num_rays_per_batch(self, num_rays_per_batch: int) -> None:
-        """Change the number of pixels of a batch."""
-        self.num_rays_per_batch = num_rays_per_batch
-
     def begin(self, step: int) -> None:
         """Seed the draws of a step, unless that was done."""
         if step != self._step:
             self._step = step
-            self.generator.manual_seed((self._seed * _STRIDE + step) % 2**63)
+            self._seed_draws(step)
 
     def sample(self, step: int) -> PixelBatch:
         """Pixels for a step."""
@@ -134,10 +130,62 @@ class SLPixelSampler:
             return self._draw()
         return self.samples.randint(len(self.samples.training), self.num_rays_per_batch, self.generator)
 
+    def _seed_draws(self, step: int) -> None:
+        self.generator.manual_seed((self._seed * _STRIDE + step) % 2**63)
+
     def _draw(self) -> Int[Tensor, "n"]:
         if self.samples.device.type == "cpu" or self.held_out:
             return self.samples.draw(self.num_rays_per_batch, self.generator, self.held_out)
         return self.samples.draw_without_waiting(self.num_rays_per_batch, self.generator)
+
+
+class CopiedPixelSampler(SLPixelSampler):
+    """Draws training pixels from a table that stays in the host's memory: what the GPU sees is one batch of it.
+
+    While a step runs, the pixels of the next one are drawn and copied. They are those of `SLPixelSampler`, always in
+    the same memory of the GPU, so that a CUDA graph can read them; a second call for a step has the same ones.
+    """
+
+    def __init__(self, table: PixelSamples, num_rays_per_batch: int, device: torch.device | str) -> None:
+        super().__init__(table, num_rays_per_batch, held_out=False)
+        self._table = table
+        self._copies = torch.cuda.Stream(device)
+        rows = torch.zeros(num_rays_per_batch, table.records.shape[1], dtype=torch.uint8, device=device)
+        none = torch.zeros(0, dtype=torch.long, device=device)
+        self._arriving, self._arriving_step = torch.zeros_like(rows), -1
+        self.samples = PixelSamples(rows, none, none)
+        self._all = torch.arange(num_rays_per_batch, device=device)
+
+    def begin(self, step: int) -> None:
+        """Make the pixels of a step those that the GPU sees, and copy those of the next one beside it."""
+        if step == self._step:
+            return
+        if step != self._arriving_step:
+            self._copy(step)
+        steps = torch.cuda.current_stream(self.samples.device)
+        steps.wait_stream(self._copies)
+        self.samples.records.copy_(self._arriving)
+        self._copies.wait_stream(steps)
+        self._copy(step + 1)
+        self._step = step
+
+    def choose(self, step: int) -> Int[Tensor, "n"]:
+        """All pixels that the GPU sees, which are those of the step."""
+        self.begin(step)
+        return self._all
+
+    def _draw(self) -> Int[Tensor, "n"]:
+        return self._all
+
+    def _copy(self, step: int) -> None:
+        self._seed_draws(step)
+        index = self._table.draw(len(self._all), self.generator)
+        # torch reuses pinned memory only after the copy from it
+        rows = torch.empty(self._arriving.shape, dtype=torch.uint8, device="cpu", pin_memory=True)
+        torch.index_select(self._table.records, 0, index, out=rows)
+        with torch.cuda.stream(self._copies):
+            self._arriving.copy_(rows, non_blocking=True)
+        self._arriving_step = step
 
 
 # Rays of camera pixels in the normalised scene.
@@ -189,7 +237,7 @@ class SLDataManagerConfig(VanillaDataManagerConfig):
     """Held-out pixels in an evaluation during training."""
     images_on_gpu: bool = True
     """Keep the table of all pixels on the GPU (24 bytes per pixel) if half of its free memory is enough; otherwise, or
-    if off, each batch is copied there, for which every step waits."""
+    if off, each batch is copied there beside the step before."""
 
     # nerfstudio's own settings for choosing images and pixels, which have no meaning here.
     masks_on_gpu: tyro.conf.Suppress[bool] = False
@@ -241,7 +289,12 @@ class SLDataManager(VanillaDataManager[SLDataset]):
     def setup_train(self) -> None:
         """Prepare the drawing of training batches."""
         self._samples = self.samples.to(self.device) if self._table_on_gpu() else self.samples
-        self.train_pixel_sampler = SLPixelSampler(self._samples, self.config.train_num_rays_per_batch, held_out=False)
+        count, device = self.config.train_num_rays_per_batch, torch.device(self.device)
+        # nerfstudio's exporters set the number of pixels from outside, and ask for many batches of one step
+        if self.test_mode == "val" and self._samples.device.type != device.type:
+            self.train_pixel_sampler = CopiedPixelSampler(self._samples, count, device)
+        else:
+            self.train_pixel_sampler = SLPixelSampler(self._samples, count, held_out=False)
         loaded = self.dataparser.loaded
         poses = torch.from_numpy(loaded.S_scene_world.poses(loaded.scan.poses.T_world_camera)).float()
         self.scene_rays = SceneRays(loaded.scan, poses.to(self.device))

@@ -12,9 +12,10 @@ from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoder import Decoded, Decoder, drop_small_regions
 from sl_nerfstudio.decoding.grid_detection import LEAST_NODES, DetectedGrid, GridDetector, refusal
-from sl_nerfstudio.decoding.grid_edges import Chosen, EdgeChooser, EdgeEvidence, load_edge_network, weight_files
+from sl_nerfstudio.decoding.grid_edges import Chosen, EdgeChooser, EdgeEvidence, weight_files
 from sl_nerfstudio.decoding.grid_fit import DrawnGrid, draw_sharpnesses, fit_densely
 from sl_nerfstudio.decoding.grid_graph import symbol_log_ratio
+from sl_nerfstudio.decoding.grid_networks import ImageNetworks, LoadedNetworks
 from sl_nerfstudio.decoding.grid_phases import (
     LEAST_MASK,
     map_from_pixels,
@@ -53,9 +54,11 @@ _LOOKED_AT = 1200  # pixels of the longer side at which the grid is looked for f
 class GridImageDecoder:
     """Decodes images of one pattern. Create it once for all frames; the same image always gives the same result."""
 
-    def __init__(self, pattern: GridPattern) -> None:
+    def __init__(self, pattern: GridPattern, networks: ImageNetworks | None = None) -> None:
+        """`networks`: where they are computed; by default here on the CPU."""
         self.pattern = pattern
-        self._detector = GridDetector(pattern)
+        self._networks = LoadedNetworks() if networks is None else networks
+        self._detector = GridDetector(pattern, self._networks.unet)
 
     def decode(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> Decoded:
         """Projector coordinates of every pixel that shows the pattern.
@@ -142,7 +145,7 @@ class GridImageDecoder:
     @cached_property
     def edges(self) -> EdgeChooser:
         """Continues coordinates beside edges."""
-        return EdgeChooser(load_edge_network(), self.pattern, self.drawn)
+        return EdgeChooser(self._networks.edges, self.pattern, self.drawn)
 
     def _normalise(
         self, grey: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"], pixels_a_period: float
@@ -168,6 +171,12 @@ class NetworkDecoder(Decoder[GridPattern]):
     version: ClassVar[int] = 10
     reads: ClassVar[str] = GridPattern.kind
     sequence: ClassVar[bool] = False
+    networks: ImageNetworks | None = None  # on a GPU; None: loaded here on the CPU
+
+    @property
+    def key(self) -> str:
+        """See `Decoder`; what a GPU gives may differ in the last digits."""
+        return super().key if self.networks is None else f"{super().key} on a GPU"
 
     def decode(self, images: Sequence[Pixels], names: Sequence[str]) -> Decoded:
         """Decode the one image of a frame."""
@@ -184,4 +193,4 @@ class NetworkDecoder(Decoder[GridPattern]):
     @cached_property
     def images(self) -> GridImageDecoder:
         """The decoder of single images."""
-        return GridImageDecoder(self.layout)
+        return GridImageDecoder(self.layout, self.networks)

@@ -12,7 +12,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.decoding.decoder import DecodingError
-from sl_nerfstudio.decoding.grid_edges import load_graph_network, load_unet
+from sl_nerfstudio.decoding.grid_edges import load_graph_network
 from sl_nerfstudio.decoding.grid_graph import (
     DOWN,
     LEAST_PIECE,
@@ -37,6 +37,7 @@ from sl_nerfstudio.decoding.grid_phases import (
     RECTIFIED_PERIOD,
     STRIDE,
     GridAppearance,
+    Maps,
     RectifiedImage,
     clear_places,
     guess_appearances,
@@ -147,8 +148,8 @@ class DetectedGrid:
 class GridDetector:
     """Finds the grid of one pattern in images, with the trained networks."""
 
-    def __init__(self, pattern: GridPattern) -> None:
-        self._unet = load_unet()
+    def __init__(self, pattern: GridPattern, unet: Maps) -> None:
+        self._unet = unet
         self._recogniser = NodeRecogniser(pattern)
 
     def detect(self, grey: Float32[ndarray, "h w"]) -> DetectedGrid | None:

@@ -19,6 +19,7 @@ from sl_nerfstudio.decoding.grid_graph import GraphNetwork
 from sl_nerfstudio.decoding.grid_phases import (
     STRIDE,
     LevelNetwork,
+    Maps,
     RectifiedImage,
     UNet,
     from_pattern,
@@ -290,7 +291,7 @@ class Chosen:
 class EdgeChooser:
     """Applies the trained network to captures of one pattern."""
 
-    def __init__(self, network: EdgeNetwork, grid: GridPattern, drawn: tuple[DrawnGrid, ...]) -> None:
+    def __init__(self, network: Maps, grid: GridPattern, drawn: tuple[DrawnGrid, ...]) -> None:
         self._network = network
         self._grid = grid
         self._drawn = drawn
@@ -322,9 +323,7 @@ class EdgeChooser:
         for first in range(0, rows, _STRIP):
             begin, last = max(0, first - MARGIN), min(first + _STRIP, rows)
             strip = np.ascontiguousarray(channels[:, begin : min(last + MARGIN, rows)])
-            with torch.inference_mode():
-                maps = self._network.maps(torch.from_numpy(strip)[None].contiguous(memory_format=torch.channels_last))
-            here = maps[0].permute(1, 2, 0).numpy()[(first - begin) // STRIDE :]
+            here = self._network(strip)[(first - begin) // STRIDE :]
             _choose(here, known, self._steps, first, last, step, wrong)
         return step, wrong
 

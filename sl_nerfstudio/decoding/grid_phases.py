@@ -1,5 +1,6 @@
 """Phases and symbols as the U-Net reads them in a rectified image, and their values at the pixels of the capture."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from sl_nerfstudio.decoding.grid_graph import GridGraph, PhaseMaps, phase_maps
-from sl_nerfstudio.parallel import compiled
+from sl_nerfstudio.parallel import DeviceName, compiled
 from sl_nerfstudio.pattern.codes import SYMBOLS
 from sl_nerfstudio.pattern.grid import GridPattern
 
@@ -91,6 +92,23 @@ class UNet(LevelNetwork):
         """Predict for images whose sides are multiples of `MULTIPLE`."""
         out = self.maps(channels)
         return NetworkOutput(out[:, 0], out[:, 1:5], out[:, 5:])
+
+
+Maps = Callable[[Float32[ndarray, "c h2 w2"]], Float32[ndarray, "h w outputs"]]
+"""A network as a function of arrays: its outputs at half the resolution of the image."""
+
+
+class NetworkOnDevice:
+    """A network as `Maps`, wherever it computes."""
+
+    def __init__(self, network: LevelNetwork, device: DeviceName = "cpu") -> None:
+        self._network, self._device = network.to(device), device
+
+    def __call__(self, channels: Float32[ndarray, "c h2 w2"]) -> Float32[ndarray, "h w outputs"]:
+        """Its outputs; a GPU computes with all digits of float32, too."""
+        image = torch.from_numpy(channels)[None].contiguous(memory_format=torch.channels_last)
+        with torch.inference_mode(), torch.backends.cudnn.flags(enabled=True, allow_tf32=False):
+            return self._network.maps(image.to(self._device))[0].permute(1, 2, 0).cpu().numpy()
 
 
 class ConvolutionPair(nn.Sequential):
@@ -341,13 +359,11 @@ class PixelPhases:
         return self.probability > LEAST_MASK
 
 
-def predict_maps(rectified: RectifiedImage, network: UNet) -> PhaseMaps:
-    """Mask, phases and symbols of a rectified image."""
-    channels = torch.from_numpy(network_channels(rectified.image))[None].contiguous(memory_format=torch.channels_last)
-    with torch.inference_mode():
-        output = network(channels)
-        mask = torch.sigmoid(output.mask[0])
-    return phase_maps(mask.numpy(), output.phase[0].contiguous().numpy(), output.symbol[0].contiguous().numpy())
+def predict_maps(rectified: RectifiedImage, network: Maps) -> PhaseMaps:
+    """Mask, phases and symbols of a rectified image, by the U-Net."""
+    output = np.moveaxis(network(network_channels(rectified.image)), -1, 0)
+    mask = torch.sigmoid(torch.from_numpy(output[0]))
+    return phase_maps(mask.numpy(), np.ascontiguousarray(output[1:5]), np.ascontiguousarray(output[5:]))
 
 
 def clear_places(maps: PhaseMaps) -> Bool[ndarray, "h w"]:

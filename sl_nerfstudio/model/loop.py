@@ -413,7 +413,7 @@ class SLTrainer(Trainer):
 
     def _why_not_recorded(self) -> str:
         """Why steps cannot be recorded as a CUDA graph; "" if they can."""
-        c, data = self.config, self.pipeline.datamanager
+        c = self.config
         if torch.device(self.device).type != "cuda":
             return f"the run is on {self.device}"
         reasons = {
@@ -422,7 +422,6 @@ class SLTrainer(Trainer):
             "--gradient-accumulation-steps": any(n != 1 for n in self.gradient_accumulation_steps.values()),
             "--log-gradients True": c.log_gradients,
             f"{self.world_size} processes": self.world_size > 1,
-            "the table of pixels is not on the GPU": data.train_pixel_sampler.samples.device.type == "cpu",
         }
         return ", ".join(reason for reason, holds in reasons.items() if holds)
 
@@ -528,7 +527,8 @@ class SLTrainer(Trainer):
         if why:
             print(paragraph("graph", _not_recorded(why)), flush=True)
         else:
-            self.record_steps(CudaRecorder([self.pipeline.datamanager.train_pixel_sampler.generator]))
+            generator = self.pipeline.datamanager.train_pixel_sampler.generator
+            self.record_steps(CudaRecorder([generator] if generator.device.type == "cuda" else []))
 
     def _leave_folder(self) -> None:
         leave = getattr(self.config, "leave_folder", None)

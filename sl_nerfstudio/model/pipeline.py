@@ -178,7 +178,7 @@ class SLPipeline(VanillaPipeline):
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
         """Outputs, losses and metrics of a step; by kernels without outputs, where there are kernels for all of it."""
         sampler, model = self.datamanager.train_pixel_sampler, self._sl_model
-        if sampler.samples.device != model.pattern.device or not model.has_kernels:
+        if not model.has_kernels:
             return super().get_train_loss_dict(step)
         from sl_nerfstudio.model.kernel_step import kernel_step  # imports Triton
 

@@ -13,7 +13,7 @@ from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.schedulers import SchedulerConfig
 from nerfstudio.engine.trainer import TrainerConfig
 
-from sl_nerfstudio.console import phase, short_path
+from sl_nerfstudio.console import paragraph, phase, short_path
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig, load_scan, require_same_scan, scan_root
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
@@ -36,6 +36,7 @@ from sl_nerfstudio.model.run_files import (
     require_unused,
     settings_fingerprint,
 )
+from sl_nerfstudio.parallel import gpu_fault, gpu_found
 from sl_nerfstudio.scan import require_valid
 from sl_nerfstudio.storage import write_atomic
 
@@ -278,7 +279,7 @@ SLTrainerConfig.__dataclass_fields__ = {name: _fields[name] for name in (*_FIRST
 
 def default_device() -> Literal["cpu", "cuda"]:
     """`cuda` where torch can use a GPU, else `cpu`."""
-    return "cuda" if torch.cuda.is_available() else "cpu"
+    return "cuda" if gpu_found()[0] else "cpu"
 
 
 def _require_devices(machine: MachineConfig) -> None:
@@ -294,6 +295,15 @@ def _require_devices(machine: MachineConfig) -> None:
         raise UserError(
             f"--machine.device-type {kind}: torch {torch.__version__} finds no such device on this machine. "
             "Leave the option out to train on an available device."
+        )
+    _, ignored = gpu_found()
+    if kind == "cpu" and ignored:
+        print(paragraph("gpu", f"The GPU is not used: {ignored}."), flush=True)
+    if kind == "cuda" and count == 1 and gpu_fault():
+        raise UserError(
+            f"--machine.device-type {kind}: the GPU cannot be used: {gpu_fault()}\n"
+            "    cause:  its driver is too old, torch has no kernels for it, or other programs use its memory\n"
+            "    remedy: give --machine.device-type cpu; python -m sl_nerfstudio says what was found"
         )
     if kind == "cpu" and count * machine.num_machines != 1:
         raise UserError(

@@ -70,6 +70,9 @@ class ProcessConfig:
     color: Path | None = None
     """folder with photographs without the pattern, each from the same place as the frame that it is named like: the
     colours of the mesh; Gray code needs none, it has images in full light"""
+    device: Literal["cuda", "cpu"] | None = None
+    """where the networks that read a coded grid are computed; default: on the GPU if there is one that works, which one
+    process opens for all"""
     jobs: int | None = None
     """number of processes that decode frames; default: one for each core, as far as there is memory for
     them"""

@@ -1,15 +1,12 @@
 """The frame stage: every capture decoded and calibrated by itself, in several processes."""
 
 import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
-from multiprocessing import connection, get_context, resource_tracker
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,7 +22,14 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.matching.lines import pixels_a_period
 from sl_nerfstudio.matching.matcher import DecodedImage, LineMatcher
-from sl_nerfstudio.parallel import cores, memory_of_process, one_library_thread, only_one_library_thread
+from sl_nerfstudio.parallel import (
+    cores,
+    end_with_parent,
+    memory_of_process,
+    no_interrupts,
+    one_library_thread,
+    only_one_library_thread,
+)
 from sl_nerfstudio.processing.cache import StageStore, stage_key
 from sl_nerfstudio.processing.captures import CapturedFrame, Captures
 from sl_nerfstudio.processing.config import ProcessConfig
@@ -269,7 +273,6 @@ class FrameWorker:
 
 # Worker processes that end with their parent, whatever ends it, and leave control-C to it.
 
-_EXIT_ORPHANED = 1
 _PROCESS, _PIXEL = 1.4e9, 200  # bytes that decoding a photograph takes: of any size, and for each pixel that is decoded
 _READ = 15  # bytes for each pixel of a photograph while it is read
 _MAIN_PROCESS = 1.0e9  # bytes of the process that collects the results, without the clouds that it may keep
@@ -300,28 +303,9 @@ def worker_pool(workers: int, initialise: Callable[..., None], *arguments: objec
         pool.shutdown(cancel_futures=True)
 
 
-@contextmanager
-def no_interrupts() -> Iterator[None]:
-    """Processes started in the block never see control-C: the terminal sends it to them, too, and each would print."""
-    resource_tracker.ensure_running()  # when it starts by itself, it lets signals through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
 def _start(initialise: Callable[..., None], *arguments: object) -> None:
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     initialise(*arguments)
-
-
-def _end_with_parent() -> None:
-    """Wait for the end of the parent: the pipe to it, which only it holds, is then closed by the kernel."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(_EXIT_ORPHANED)
 
 
 def run_frame_stage(config: ProcessConfig, job: FrameJob, captures: Captures) -> list[FrameStageResult]:
@@ -400,7 +384,7 @@ def run_frames(job: FrameJob, frames: Sequence[CapturedFrame], jobs: int) -> Gen
                 ready = as_completed([pool.submit(_work, frame) for frame in frames])
             for future in ready:
                 yield future.result()
-    except BrokenProcessPool as error:
+    except (BrokenProcessPool, EOFError, ConnectionError) as error:  # a worker; the process that has the networks
         raise UserError(
             f"a process that decoded frames was killed\n    cause:  {jobs} processes need more memory than there is\n"
             "    remedy: give a smaller number with --jobs; frames decoded so far are kept"

@@ -22,9 +22,12 @@ from sl_nerfstudio.calibration.stated import (
 from sl_nerfstudio.console import track
 from sl_nerfstudio.decoding.decoder import Decoder
 from sl_nerfstudio.decoding.decoders import choose_decoder
+from sl_nerfstudio.decoding.grid import NetworkDecoder
+from sl_nerfstudio.decoding.grid_networks import networks_for_all_processes
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import Similarity, fit_similarity
+from sl_nerfstudio.parallel import usable_device
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import PatternLayout
 from sl_nerfstudio.processing.cache import StageStore
@@ -297,7 +300,11 @@ def read_captured(config: ProcessConfig) -> CapturedFrames:
     if layout is None:
         raise ValueError("a pattern is a file or a resolution")
     decoder = decoder or choose_decoder(layout, config.decoder, config.pattern, config.sequence is not None)
-    sentences: Sequence[str] = [] if video is None else video.sentences()
+    sentences: list[str] = [] if video is None else list(video.sentences())
+    if isinstance(decoder, NetworkDecoder):
+        device, sentence = usable_device(config.device)
+        decoder.networks = None if device == "cpu" else networks_for_all_processes(device)
+        sentences += [sentence] if sentence else []
     if not isinstance(layout, GrayCode):
         return CapturedFrames(decoder, captures, CaptureNotes(tuple(sentences), video=video))
     captures = captures.with_faults(incomplete(captures, layout))

@@ -12,7 +12,6 @@ from pathlib import Path, PosixPath
 from typing import Any, Literal, Union, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
-import torch
 import yaml
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
@@ -25,6 +24,7 @@ from sl_nerfstudio.model.outputs import TrainedModel
 from sl_nerfstudio.model.pipeline import SLPipelineConfig, require_together
 from sl_nerfstudio.model.run_files import Checkpoint, checkpoints_in, read_checkpoint, settings_fingerprint
 from sl_nerfstudio.model.trainer import SLTrainerConfig
+from sl_nerfstudio.parallel import DeviceName, usable_device
 from sl_nerfstudio.scan import read_scan
 
 # config.yml of a run, read without running anything from it: only the settings of this package's runs are made.
@@ -253,11 +253,12 @@ class TrainedRun:
     step: int
 
 
-def load_run(config_path: Path | str, data: Path | None = None) -> TrainedRun:
+def load_run(config_path: Path | str, data: Path | None = None, device: DeviceName | None = None) -> TrainedRun:
     """Load the last checkpoint of the run that `config_path` (config.yml) describes.
 
     nerfstudio's own `eval_setup` fails with assertions or tracebacks if files were moved or truncated. Here a run whose
-    folder was moved is found next to its config.yml, and `data` gives the scan folder if that was moved.
+    folder was moved is found next to its config.yml, and `data` gives the scan folder if that was moved. By default
+    the model is on the GPU if there is one that works.
     Raises UserError for anything missing, broken or made by another method.
     """
     with warnings.catch_warnings():
@@ -277,7 +278,7 @@ def load_run(config_path: Path | str, data: Path | None = None) -> TrainedRun:
     require_settings(path, config)
     root = _scan_folder(config, data)
     config.pipeline.datamanager.data = root
-    device = "cuda" if torch.cuda.is_available() else "cpu"
+    device, _ = usable_device(device)
     parser = config.pipeline.datamanager.dataparser
     loaded = load_scan(root, parser.intrinsics_change, parser.length_factor)
     require_together(config.pipeline, checkpoint.weights, root, loaded.fingerprint)

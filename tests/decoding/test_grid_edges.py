@@ -18,7 +18,7 @@ from sl_nerfstudio.decoding.grid_edges import (
     steps,
 )
 from sl_nerfstudio.decoding.grid_fit import draw_sharpnesses
-from sl_nerfstudio.decoding.grid_phases import from_pattern, to_pattern
+from sl_nerfstudio.decoding.grid_phases import NetworkOnDevice, from_pattern, to_pattern
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.images import as_grey
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -167,7 +167,8 @@ def test_the_step_that_is_chosen_is_the_best_of_the_possible_ones(rows):
     layers = [rng.normal(size=(count, rows, 48)).astype(np.float32) for count in (7, 8)]
     view = EdgeView(layers[0], fitted, fitted, layers[1])
     grid = GridPattern()
-    found, odds = EdgeChooser(network, grid, draw_sharpnesses(grid.render(), grid.period))._predict(view)
+    chooser = EdgeChooser(NetworkOnDevice(network), grid, draw_sharpnesses(grid.render(), grid.period))
+    found, odds = chooser._predict(view)
     with torch.inference_mode():
         output = network(torch.from_numpy(view.channels())[None].contiguous(memory_format=torch.channels_last))
     known = np.pad(np.isfinite(fitted[..., 0]), 13)

@@ -13,6 +13,7 @@ from sl_nerfstudio.decoding.grid_phases import (
     RECTIFIED_PERIOD,
     STRIDE,
     GridAppearance,
+    NetworkOnDevice,
     clear_places,
     guess_appearances,
     map_from_pixels,
@@ -101,7 +102,7 @@ def test_the_network_reads_the_phases_of_a_drawn_grid():
     """The nodes of the pattern are where the phases that were read are zero."""
     image = capture(14, 0)
     rectified = rectify(image, GridAppearance(14.0, 0.0))
-    phases = sample_pixels(predict_maps(rectified, load_unet()), rectified, image.shape)
+    phases = sample_pixels(predict_maps(rectified, NetworkOnDevice(load_unet())), rectified, image.shape)
     grid = GridPattern()
     x, y = np.meshgrid(*[np.arange(300) + 0.5 - 150] * 2)
     exact = (np.stack([x, y], -1) * 20 / 14 + 400 - (grid.x0, grid.y0)) / grid.period

@@ -39,11 +39,12 @@ def test_everything_about_a_gpu_can_be_tried_on_the_cpu(tiny_root, tmp_path, mon
         "rmse": lambda *_: {"rmse_mm": 0.1},
     }.items():
         monkeypatch.setattr(gpu, name, stand_in)
-    only = ("kernels", "step paper numba", "surface paper cpu", "encoding lean nerfstudio")
+    only = ("kernels", "step paper numba", "surface paper cpu", "encoding lean nerfstudio", "resume default")
     config = gpu.Config("cpu", tiny_root, steps=1, compared_steps=1, only=only)
     found = gpu.main(config)
     assert max(found["kernels"]["numba"]) < 1e-4
     assert found["step paper numba"]["loop_ms"] > 0 and found["surface paper cpu"]["rmse_mm"] == 0.1
+    assert found["resume default"] == {"steps": 1, "resumed": 0.0, "in_one_go": 0.0}
     assert found["encoding lean nerfstudio torch"]["error"] == "division by zero"  # the others are still measured
     assert json.loads((tmp_path / config.output).read_text()) == found
     names = set(gpu.parts(gpu.Config(), tmp_path))  # on a GPU

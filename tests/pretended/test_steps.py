@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from benchmarks.pretended.gpu import MixedDevicesError, PretendedGpu
+from benchmarks.pretended.recorder import PretendedRecorder
 from sl_nerfstudio.bundle_adjustment.adjust import CrossValidation
 from sl_nerfstudio.bundle_adjustment.covariance import joint_of_prior
 from sl_nerfstudio.field import device_kernels
+from sl_nerfstudio.model.loop import WARM_UP
 from sl_nerfstudio.model.pose_refinement import ScanAdjustment, pose_prior, scene_rig
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
@@ -85,14 +87,42 @@ def test_kernels_that_do_not_compile_are_said_before_the_first_step_and_plain_to
         assert not [name for name in seen.launches if "triton" in name]
 
 
-def test_a_pixel_table_that_does_not_fit_is_copied_batch_by_batch(begin, monkeypatch):
+def test_a_pixel_table_that_does_not_fit_gives_the_batches_of_one_on_the_host(begin, monkeypatch):
+    """While the GPU works on one batch, the next one is copied; the host waits for neither."""
+    here = begin("sl-neus-paper", device="cpu").pipeline.datamanager
+    wanted = [here.train_pixel_sampler.sample(step) for step in (7, 8, 9, 3, 4)]
     with PretendedGpu() as gpu:
         monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (1000, 1000))
-        training = begin("sl-neus-paper")
-        training.step()
-        with gpu.counting() as seen:
-            training.step()
-        assert seen.waits and all("dataparser.py" in place for place in seen.waits), dict(seen.waits)
+        sampler = begin("sl-neus-paper").pipeline.datamanager.train_pixel_sampler
+        sampler.sample(6)
+        for step, batch in zip((7, 8, 9, 3, 4), wanted, strict=True):
+            with gpu.counting() as seen:
+                found = [sampler.sample(step), sampler.samples.at(sampler.choose(step))]
+            assert not seen.waits, dict(seen.waits)
+            for name, values in vars(batch).items():
+                for one in found:
+                    there = getattr(one, name)
+                    assert there.device.type == "cuda"
+                    torch.testing.assert_close(there.cpu(), values, rtol=0, atol=0, equal_nan=True, msg=name)
+
+
+@pytest.mark.parametrize("backend", ["torch", pytest.param("triton", marks=pytest.mark.slow)])
+def test_kernels_and_recording_stay_where_the_pixel_table_does_not_fit(begin, monkeypatch, backend):
+    def trained(recorded):
+        with PretendedGpu(kernels=backend == "triton") as gpu:
+            monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (1000, 1000))
+            training = begin("sl-neus-paper", partial(with_poses, "off", "adjust", backend))
+            if recorded:
+                training.trainer.record_steps(PretendedRecorder(gpu))
+            for _ in range(WARM_UP + 2):
+                with gpu.counting() as seen:
+                    losses = training.step()[0]
+            assert recorded == (training.trainer.recorded is not None) and not seen.waits, dict(seen.waits)
+            assert recorded or ("triton render" in seen.launches) == (backend == "triton")
+            return float(losses), training.pipeline.datamanager.train_pixel_sampler.samples.records.cpu()
+
+    (loss, records), (wanted, expected) = trained(True), trained(False)
+    assert loss == pytest.approx(wanted, rel=1e-6) and torch.equal(records, expected)
 
 
 def test_the_pretended_gpu_finds_what_a_gpu_refuses_or_waits_for():

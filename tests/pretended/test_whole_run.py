@@ -8,6 +8,7 @@ import torch
 
 from benchmarks.pretended.gpu import PretendedGpu
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.model import trainer
 from sl_nerfstudio.model.run_files import checkpoints_in
 from sl_nerfstudio.model.viewer import MODES, RENDERED, ViewerSurface
 from sl_nerfstudio.runs.export import build_surface
@@ -53,6 +54,16 @@ def _recordable(training):
 def test_the_gpus_of_apple_are_refused(begin):
     with pytest.raises(UserError, match=r"device-type mps: Apple's GPUs do not compute in float64.* on the CPU"):
         begin("sl-neus", device="mps")
+
+
+def test_a_gpu_that_cannot_be_used_is_said_before_a_training_begins(begin, monkeypatch, capsys):
+    monkeypatch.setattr(trainer, "gpu_found", lambda: (False, "its driver is too old"))
+    begin("sl-neus", device="cpu")
+    assert "The GPU is not used: its driver is too old." in " ".join(capsys.readouterr().out.split())
+    with PretendedGpu():
+        monkeypatch.setattr(trainer, "gpu_fault", lambda: "no kernel image is available")
+        with pytest.raises(UserError, match=r"cuda: the GPU cannot be used: no kernel image(.|\n)*type cpu"):
+            begin("sl-neus")
 
 
 def _evaluates(training, folder):

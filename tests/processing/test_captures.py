@@ -10,8 +10,11 @@ import pytest
 from PIL import Image
 
 from sl_nerfstudio.calibration.formats import camera_names, read_device_file
+from sl_nerfstudio.decoding.grid_networks import LoadedNetworks
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.gray_code import GrayCode
+from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.processing import inputs
 from sl_nerfstudio.processing.captures import describe_faults, find_captures, incomplete
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.inputs import read_captured
@@ -195,6 +198,21 @@ def test_a_video_of_gray_code_is_refused(tmp_path):
     (tmp_path / "v.mp4").write_bytes(b"x")
     with pytest.raises(UserError, match=r"v.mp4: is a video, and Gray code needs one image for each pattern"):
         read_captured(config(tmp_path, images=tmp_path / "v.mp4", pattern=tmp_path / "p.json"))
+
+
+@pytest.mark.parametrize("device", ["cpu", "cuda"])
+def test_the_networks_are_computed_where_the_flag_says(tmp_path, monkeypatch, device):
+    networks = LoadedNetworks()
+    monkeypatch.setattr(inputs, "usable_device", lambda asked: (asked, f"said of {asked}"))
+    monkeypatch.setattr(inputs, "networks_for_all_processes", lambda device: networks)
+    (tmp_path / "p.json").write_bytes(GridPattern().encode())
+    images = tmp_path / "images"
+    images.mkdir()
+    for k in range(3):
+        _write(images / f"{k}.png")
+    captured = read_captured(replace(config(tmp_path, images=images, pattern=tmp_path / "p.json"), device=device))
+    assert captured.decoder.networks is (networks if device == "cuda" else None)
+    assert captured.notes.sentences == (f"said of {device}",)
 
 
 def flat(size, part):

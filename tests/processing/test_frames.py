@@ -213,7 +213,8 @@ _PARENT = """
 import os, time
 from concurrent.futures import as_completed
 from sl_nerfstudio.cli.run import run
-from sl_nerfstudio.processing.frames import no_interrupts, worker_pool
+from sl_nerfstudio.parallel import no_interrupts
+from sl_nerfstudio.processing.frames import worker_pool
 
 def begin(word):
     print(word, os.getpid(), flush=True)

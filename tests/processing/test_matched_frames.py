@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.decoding.grid import NetworkDecoder
+from sl_nerfstudio.decoding.grid_networks import networks_for_all_processes
 from sl_nerfstudio.matching.matcher import LineMatcher
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.processing import frames
 from sl_nerfstudio.processing.captures import find_captures
-from sl_nerfstudio.processing.frames import FrameJob, FrameWorker
+from sl_nerfstudio.processing.frames import FrameJob, FrameWorker, run_frames
 from sl_nerfstudio.processing.masks import find_masks
 from sl_nerfstudio.processing.records import DecodedStore
 from sl_nerfstudio.scan import read_scan
@@ -44,6 +45,18 @@ def frame(captures):
 @pytest.fixture(scope="module")
 def result(job, frame):
     return FrameWorker(job)(frame)
+
+
+def test_networks_in_a_process_of_their_own_give_workers_the_same_frames(job, captures, tmp_path):
+    """As those on a GPU do, which one process opens for all."""
+    shared = NetworkDecoder(job.decoder.layout)
+    shared.networks = networks_for_all_processes("cpu")
+    todo = find_captures(captures / "images", False).frames
+    found = {x.name: x for x in run_frames(replace(job, decoder=shared, work=tmp_path, last_step="decode"), todo, 2)}
+    for frame in todo:
+        wanted = job.decoder.decode([frame.read(0)], [frame.name])
+        got = DecodedStore(tmp_path, shared.key).load(frame, found[frame.name].key)
+        np.testing.assert_allclose(got.coords, wanted.coords, rtol=0, atol=1e-3)
 
 
 def counted(monkeypatch):
