@@ -8,6 +8,8 @@ a scan without a known length has no unit. With --full, the kept frames also go 
 """
 
 import argparse
+import shutil
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,9 +20,18 @@ from jaxtyping import Float64, UInt8
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.common.measuring import options, write_rows
+from sl_nerfstudio.calibration.formats import read_device_file
+from sl_nerfstudio.capture.camera import Video
+from sl_nerfstudio.cli.process import process_photographs
+from sl_nerfstudio.decoding.grid import NetworkDecoder
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.geometry.lie import DevicePoses, fit_similarity
+from sl_nerfstudio.live.session import Session
+from sl_nerfstudio.live.sources import CameraSource
 from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.scan.write import device_fields, encode_json
 from sl_nerfstudio.storage import write_atomic
 from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
@@ -166,3 +177,118 @@ def record(folder: Path, scene: str, steps: Sequence[Step], seed: int) -> Record
     writer.release()
     write_atomic(done, note)
     return found
+
+
+# A session, and its poses against the truth.
+
+
+@dataclass(frozen=True)
+class LiveRow:
+    """What one walk gave. Errors are those of the camera: RMS and largest."""
+
+    walk: str
+    images: int
+    tracked: int
+    uncertain: int
+    lost: int
+    kept: int
+    seconds: float  # median of an image, from image to updated model
+    slowest: float  # nine of ten are faster
+    cpu: float  # seconds of processor time an image, mean: the machine may be shared
+    first_half: float  # median seconds an image in the first and in the second half of those that were tracked
+    second_half: float
+    rotation_deg: tuple[float, float]  # of all tracked images
+    position: tuple[float, float]  # millimetres
+    wrong: int  # tracked images whose place is off by more than 1 degree or 1 % of the distance
+    full_rotation_deg: float | None = None  # RMS of the kept frames after sl-process
+    full_position: float | None = None
+    kept_rotation_deg: float | None = None  # RMS of the same frames live
+    kept_position: float | None = None
+
+
+def camera_errors(
+    T_world_camera: Float64[ndarray, "n 4 4"], truth: Float64[ndarray, "n 4 4"]
+) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"]]:
+    """Degrees and millimetres by which cameras are off, after the similarity that fits their centres best."""
+    S = fit_similarity(T_world_camera[:, :3, 3], truth[:, :3, 3])
+    aligned = S.poses(T_world_camera)
+    turned = Rotation.from_matrix(aligned[:, :3, :3].transpose(0, 2, 1) @ truth[:, :3, :3]).magnitude()
+    return np.degrees(turned), np.linalg.norm(aligned[:, :3, 3] - truth[:, :3, 3], axis=1)
+
+
+def run_session(recording: Recording, output: Path) -> tuple[Session, float]:
+    """Give a video to a new session; returns it with the processor time it took, seconds."""
+    shutil.rmtree(output, ignore_errors=True)
+    camera, projector = recording_devices(recording)
+    decoder = NetworkDecoder(GridPattern())
+    source = CameraSource(Video(recording.video))
+    begun = time.process_time()
+    with Session(output, decoder, camera, projector, output.parent / "scan.work") as session:
+        session.run(source, lambda update: None)
+    source.close()
+    return session, time.process_time() - begun
+
+
+def recording_devices(recording: Recording) -> tuple[Device, Device]:
+    """Camera and projector, as the files of a recording say."""
+    pattern = GridPattern()
+    return (
+        read_device_file(recording.intrinsics, "camera", _SIZE),
+        read_device_file(recording.intrinsics, "projector", (pattern.w, pattern.h)),
+    )
+
+
+def measure(walk: str, recording: Recording, output: Path, full: bool) -> LiveRow:
+    """One walk."""
+    session, cpu = run_session(recording, output)
+    rows, poses, truth = session.rows, session.poses, recording.truth.T_world_camera
+    state = np.array([row.state for row in rows])
+    tracked = (state == "tracked") & np.isfinite(poses).all((1, 2))
+    turned, moved = camera_errors(poses[tracked], truth[tracked])
+    distance = float(np.median(np.linalg.norm(truth[:, :3, 3], axis=1)))
+    seconds = np.array([row.seconds for row in rows])
+    halves = [float(np.median(part)) for part in np.array_split(seconds[tracked][3:], 2)]
+    found = LiveRow(
+        walk, len(rows), int(tracked.sum()), int((state == "uncertain").sum()), int((state == "lost").sum()),
+        sum(row.kept >= 0 for row in rows), float(np.median(seconds)), float(np.quantile(seconds, 0.9)),
+        cpu / len(rows), *halves, _rms_and_largest(turned), _rms_and_largest(moved),
+        int(((turned > 1) | (moved > 0.01 * distance)).sum()),
+    )  # fmt: skip
+    return _with_full(found, recording, session) if full else found
+
+
+def _rms_and_largest(errors: Float64[ndarray, "n"]) -> tuple[float, float]:
+    return float(np.sqrt((errors**2).mean())), float(errors.max())
+
+
+def _with_full(found: LiveRow, recording: Recording, session: Session) -> LiveRow:
+    """The same with the poses that sl-process gives the kept frames."""
+    scan = session.root.parent / "scan"
+    shutil.rmtree(scan, ignore_errors=True)
+    process_photographs(ProcessConfig(session.captures, recording.pattern, recording.intrinsics, scan, jobs=1))
+    frames = {frame.name: frame.T_world_camera for frame in read_scan(scan).frames}
+    images = [k for k, row in enumerate(session.rows) if row.kept >= 0]
+    both = [(frames[name], k) for n, k in enumerate(images) if (name := f"frame_{n:04d}") in frames]
+    T, index = np.stack([np.asarray(T, dtype=np.float64) for T, _ in both]), [k for _, k in both]
+    truth = recording.truth.T_world_camera[index]
+    full, live = camera_errors(T, truth), camera_errors(session.poses[index], truth)
+    rms = [_rms_and_largest(errors)[0] for errors in (*full, *live)]
+    return replace(found, full_rotation_deg=rms[0], full_position=rms[1], kept_rotation_deg=rms[2], kept_position=rms[3])
+
+
+def main() -> None:
+    """Run the benchmark."""
+    config: argparse.Namespace = options(
+        __doc__, walks=WALKS, scene="head", seed=0, full=False, folder=Path("outputs/bench/live"), output=Path
+    )
+    rows: list[LiveRow] = []
+    for walk in config.walks:
+        folder = config.folder / config.scene / walk
+        recording = record(folder / "recording", config.scene, WALKS[walk](), config.seed)
+        rows.append(measure(walk, recording, folder / "live", config.full))
+        print(rows[-1], flush=True)
+        write_rows(config.output, rows, scene=config.scene, seed=config.seed)
+
+
+if __name__ == "__main__":
+    main()

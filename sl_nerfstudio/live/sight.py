@@ -1,14 +1,16 @@
 """What one image shows by itself: the surface in front of the camera, or why there is none.
 
-The image is decoded without a look at edges, and on each second pixel (see `Eye.step`): that is enough to know where a
-frame is, and takes half the time. What was read is kept, so that decoding a kept frame goes on from there.
+The image is decoded at the size at which the grid can just be read well, and without a look at edges: that is enough to
+know where a frame is, and takes a third of the time. Where that is its full size, what was read is kept, so that decoding
+a kept frame goes on from there.
 """
 
 from dataclasses import dataclass, replace
 from enum import Enum
 
+import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.capture.selection import DEFAULT_LIMITS, GridView, Selection, SelectionVerdict, measure_light
@@ -18,16 +20,19 @@ from sl_nerfstudio.decoding.grid_detection import edge_width, line_blur
 from sl_nerfstudio.decoding.grid_phases import clear_places
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.processing.video import SHARP, sharpness
 from sl_nerfstudio.registration.evidence import Frame
 from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.candidates import RayCounts
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
-from sl_nerfstudio.scan.images import as_grey, shrunk
+from sl_nerfstudio.scan.images import as_grey
 
-LATTICE = 320  # pixels of the longer side of the image on which a frame is placed
-LARGEST_SIDE = 960  # pixels of the longer side of an image that is decoded as it is; larger ones are shrunk
-RAYS = RayCounts(fit=8000, polishing=500, ranking=2500)  # by which the relative pose is found
+PERIOD = 8.5  # pixels of the grid at which images are decoded
+PERIOD_REACH = 1.2  # factor by which it may depart from that before the size is changed
+LARGEST_SIDE = 960  # pixels of the longer side at which the grid is looked for, as long as its period is not known
+LATTICE = 320  # pixels of the longer side, about, on which a frame is placed
+RAYS = RayCounts(fit=4000, polishing=300, ranking=1500)  # by which the relative pose is found
 FINEST_PERIOD = 7.0  # pixels: a finer grid is hardly read, its object is too far away
 FEWEST_POINTS = 300  # of a frame's surface, on the lattice
 WEAK = ("few points", "pure rotation", "small parallax", "planar", "ambiguous", "many outliers", "poor fit", "uncertain")
@@ -57,7 +62,7 @@ class Sight:
     """An image and what it shows; without a frame, `fault` says why."""
 
     image: UInt8[ndarray, "h w *c"]
-    first: FirstLook | None = None
+    first: FirstLook | None = None  # of its full size
     cloud: FrameCloud | None = None
     frame: Frame | None = None
     fault: Fault | None = None
@@ -67,50 +72,60 @@ class Sight:
 
 
 class Eye:
-    """Looks at images of one size."""
+    """Looks at the images of one camera."""
 
     def __init__(self, decoder: NetworkDecoder, camera: Device, projector: Device, seed: int = 0) -> None:
         """`camera` is that of the images as they come."""
-        self.decoder, self.projector, self._seed = decoder, projector, seed
-        self.shrink = -(-max(camera.w, camera.h) // LARGEST_SIDE)
-        self.camera = camera.shrunk(self.shrink)
-        self.step = max(1, round(max(self.camera.w, self.camera.h) / LATTICE))
-        self.lattice = sampled(self.camera, self.step)
+        self.decoder, self.camera, self.projector, self._seed = decoder, camera, projector, seed
         self._selection = Selection((decoder.layout.rows, decoder.layout.columns))
+        self.factor = self._largest = min(1.0, LARGEST_SIDE / max(camera.w, camera.h))
 
     @one_library_thread()
     def look(self, image: UInt8[ndarray, "h w *c"]) -> Sight:
         """Decode an image, and find the projector's relative pose and the surface."""
-        small = shrunk(image, self.shrink) if self.shrink > 1 else image
+        camera, factor, grey = self.camera, self.factor, as_grey(image)
+        if factor < 1:
+            size = round(camera.w * factor), round(camera.h * factor)
+            grey = np.asarray(cv2.resize(grey, size, interpolation=cv2.INTER_AREA))
+            across, down = size[0] / camera.w, size[1] / camera.h
+            camera = replace(camera, w=size[0], h=size[1], fl_x=camera.fl_x * across, fl_y=camera.fl_y * down,
+                             cx=camera.cx * across, cy=camera.cy * down)  # fmt: skip
         try:
-            first = self.decoder.images.look(small)
+            found = self.decoder.images.detect(grey)
         except DecodingError:
-            return Sight(image, fault=self._fault(small))
-        period = float(first.found.appearance.period)
-        blur = line_blur(first.found.rectified, first.found.maps, clear_places(first.found.maps), self.decoder.layout)
+            self.factor = self._largest
+            return Sight(image, fault=self._fault(grey))
+        period = float(found.appearance.period)
+        if not 1 / PERIOD_REACH < period / PERIOD < PERIOD_REACH:
+            self.factor = min(self._largest, factor * PERIOD / period)
+        blur = line_blur(found.rectified, found.maps, clear_places(found.maps), self.decoder.layout)
         sharp = blur is not None and blur < DEFAULT_LIMITS.most_blur
-        seen = Sight(image, first, period=period * self.shrink, sharp=sharp)
-        part = slice(self.step // 2, None, self.step)
+        first = FirstLook(grey, found, self.decoder.images.examine(grey, found))
+        seen = Sight(image, first if factor == 1 else None, period=period / factor, sharp=sharp)
+        step = max(1, round(max(camera.w, camera.h) / LATTICE))
+        part = slice(step // 2, None, step)
         coords = np.ascontiguousarray(self.decoder.images.clear_coords(first)[part, part])
         if np.isfinite(coords[..., 0]).sum() < FEWEST_POINTS:
-            too_far = period < FINEST_PERIOD
             little = Fault.TOO_LITTLE if sharp else Fault.BLURRED
-            return replace(seen, fault=Fault.TOO_FAR if too_far else little)
+            return replace(seen, fault=Fault.TOO_FAR if seen.period < FINEST_PERIOD else little)
+        lattice = sampled(camera, step)
         try:
             matches = correspondences_of(coords)
-            pose = estimate_relative_pose(*matches, self.lattice, self.projector, self._seed, RAYS)
+            pose = estimate_relative_pose(*matches, lattice, self.projector, self._seed, RAYS)
             mask = np.ascontiguousarray(first.mask[part, part])
-            cloud = frame_cloud("live", coords, self.lattice, self.projector, pose, seen=mask)
+            cloud = frame_cloud("live", coords, lattice, self.projector, pose, seen=mask)
         except RelativePoseError:
             return replace(seen, fault=Fault.NO_RELATIVE_POSE)
         weak = tuple(d.kind for d in pose.degeneracies if d.kind in WEAK)
         return replace(seen, cloud=cloud, frame=Frame.of(cloud), weak=weak)
 
-    def _fault(self, image: UInt8[ndarray, "h w *c"]) -> Fault:
-        grey = as_grey(image)
+    def _fault(self, grey: Float32[ndarray, "h w"]) -> Fault:
+        """Why an image shows no grid; motion blurs in one direction only, which the edges in the other do not show."""
         nothing = np.full((*self._selection.shape, 2), np.nan, dtype=np.float32)
         view = GridView(nothing, float("nan"), None, measure_light(grey), edge_width(grey))
-        return _FAULTS.get(self._selection.judge(view, 0.0), Fault.NO_PATTERN)
+        fault = _FAULTS.get(self._selection.judge(view, 0.0), Fault.NO_PATTERN)
+        moved = fault is Fault.NO_PATTERN and sharpness(np.rint(255 * grey).astype(np.uint8)) < SHARP
+        return Fault.BLURRED if moved else fault
 
 
 def sampled(camera: Device, step: int) -> Device:

@@ -1,6 +1,5 @@
 """The surface so far as small cells: how often each was seen, how well it is known, and which way it looks."""
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,14 +70,6 @@ class Surfels:
             for whole, values in zip((out.sums, out.points, out.views, out.information), part, strict=True):
                 whole[at] += values
         return out
-
-    @staticmethod
-    def of(frames: Iterable[tuple[SurfaceMap, Similarity, float]], size: float) -> "Surfels":
-        """What several frames see."""
-        found = Surfels.none(size)
-        for seen, S, sigma in frames:
-            found = found.with_frame(seen, S, sigma)
-        return found
 
     def thin_share(self, seen: SurfaceMap, S_world_camera: Similarity) -> float:
         """Share of what a frame sees that too few kept frames have seen."""

@@ -105,8 +105,8 @@ class Kept:
     frame: Frame
     T_camera_projector: Float64[ndarray, "4 4"]  # baseline one
     sigma_position: float
-    common: tuple[Commonness, ...] = ()  # what each of its pairs says of its points
-    noise: tuple[float, ...] = ()
+    common: Commonness | None = None  # what its pairs say of its points
+    noise: tuple[float, ...] = ()  # of its points, by each of its last pairs
 
 
 @dataclass
@@ -116,6 +116,7 @@ class Model:
     kept: list[Kept] = field(default_factory=list)
     nodes: Component = field(default_factory=dict)  # S_world_camera
     edges: list[PairMatch] = field(default_factory=list)
+    drawn: Component = field(default_factory=dict)  # the places at which their surfaces are in `surfels`
     surfels: Surfels = field(default_factory=lambda: Surfels.none(1.0))
 
     def __len__(self) -> int:
@@ -131,15 +132,37 @@ class Model:
             projectors[k] = S.poses(self.kept[k].T_camera_projector)
         return DevicePoses(cameras, projectors)
 
-    def rebuilt(self) -> Surfels:
-        """The surface after kept frames have moved."""
-        each = ((kept.frame.map, self.nodes[k], kept.sigma_position) for k, kept in enumerate(self.kept))
-        return Surfels.of(each, self.surfels.size)
+    def draw(self) -> None:
+        """Bring the surface to where the kept frames are; all of it where one has moved too far."""
+        size = self.kept[0].frame.map.radius / CELLS
+        new = [k for k in self.nodes if k not in self.drawn]
+        if any(_moved(self.kept[k].frame, S, self.nodes[k]) > size / 2 for k, S in self.drawn.items()):
+            self.surfels, self.drawn, new = Surfels.none(size), {}, list(self.nodes)
+        elif not self.drawn:
+            self.surfels = Surfels.none(size)
+        for k in new:
+            self.surfels = self.surfels.with_frame(self.kept[k].frame.map, self.nodes[k], self.kept[k].sigma_position)
+            self.drawn[k] = self.nodes[k]
 
 
-def centre_of(frame: Frame, S: Similarity) -> Float64[ndarray, "3"]:
-    """The middle of what a frame sees, in the world."""
-    return S.points(frame.map.centroid[None])[0]
+def _moved(frame: Frame, before: Similarity, now: Similarity) -> float:
+    """How far the middle of what a frame sees has moved; its edges, where it turned."""
+    centre = frame.map.centroid[None]
+    shift = float(np.linalg.norm(before.points(centre) - now.points(centre)))
+    return shift + now.scale * frame.map.radius * float(np.radians(angle_deg(before.R.T @ now.R)))
+
+
+@dataclass(frozen=True)
+class TrackerState:
+    """What tracking remembers besides kept frames and pairs."""
+
+    nodes: tuple[Similarity, ...]
+    drawn: tuple[Similarity, ...]
+    count: int
+    last: Similarity | None
+    lost: int
+    unconfirmed: Similarity | None
+    misfits: int
 
 
 class Tracker:
@@ -179,23 +202,31 @@ class Tracker:
         S = placed.S_world_camera
         sigma = 0.0 if number == 0 else placed.sigma_position
         kept = Kept(sight.frame, sight.cloud.pose.T_camera_projector, sigma)
-        if number == 0:
-            model.surfels = Surfels.none(S.scale * sight.frame.map.radius / CELLS)
         model.kept.append(kept)
         model.nodes[number] = S
-        for match in placed.matches:
-            match = replace(match, source=number)
-            model.edges.append(match)
-            for k, common, noise in zip((match.source, match.target), match.common, match.noise, strict=True):
-                one = model.kept[k]
-                one.common, one.noise = (_summed((*one.common, common)),), (*one.noise[-LOCAL:], noise)
-        moved = self._settle(number, placed.matches)
-        if moved:
-            model.surfels = model.rebuilt()
-        else:
-            model.surfels = model.surfels.with_frame(sight.frame.map, model.nodes[number], sigma)
+        self._add_pairs(number, placed.matches)
+        self._settle(number, placed.matches)
+        model.draw()
         self._last = model.nodes[number]
         return number
+
+    @property
+    def state(self) -> TrackerState:
+        """What is needed to go on, with the kept frames and their pairs."""
+        nodes, drawn = (tuple(one[k] for k in range(len(self.model))) for one in (self.model.nodes, self.model.drawn))
+        return TrackerState(nodes, drawn, self._count, self._last, self._lost, self._unconfirmed, self._misfits)
+
+    def resume(self, state: TrackerState, kept: Sequence[Kept], matches: Sequence[Sequence[PairMatch]]) -> None:
+        """Go on from a state; `matches` are the pairs with which each frame was kept."""
+        self.model = Model(list(kept))
+        for number, pairs in enumerate(matches):
+            self._add_pairs(number, pairs)
+        if kept:
+            self.model.nodes = dict(enumerate(state.drawn))
+            self.model.draw()
+        self.model.nodes = dict(enumerate(state.nodes))
+        self._count, self._last, self._lost = state.count, state.last, state.lost
+        self._unconfirmed, self._misfits = state.unconfirmed, state.misfits
 
     # ---- one frame
 
@@ -300,9 +331,9 @@ class Tracker:
         """Some kept frames and a new one, with what their pairs have shown of their points."""
         kept = [self.model.kept[k] for k in local]
         frames = [*(one.frame.evidence for one in kept), frame.evidence]
-        common = [_summed((Commonness.none(len(one.frame.evidence.points)), *one.common)) for one in kept]
+        common = [one.common or Commonness.none(len(one.frame.evidence.points)) for one in kept]
         noise = [float(np.median(one.noise)) if one.noise else 1.0 for one in kept]
-        own = _summed((Commonness.none(len(frame.evidence.points)), *(m.common[0] for m in found)))
+        own = sum((m.common[0] for m in found), Commonness.none(len(frame.evidence.points)))
         return ScanEvidence(frames, [*common, own], np.array([*noise, float(np.median([m.noise[0] for m in found]))]))
 
     def _judged(self, sight: Sight, S: Similarity, edges: Sequence[PairMatch], pivots: Pivots) -> Placed:
@@ -352,29 +383,29 @@ class Tracker:
 
     # ---- the model
 
-    def _settle(self, number: int, matches: Sequence[PairMatch]) -> bool:
-        """Move kept frames to where all pairs want them; True if others than the new one may have moved."""
+    def _add_pairs(self, number: int, matches: Sequence[PairMatch]) -> None:
+        """Add the pairs with which a frame was kept, and what they say of the points of both of their frames."""
+        for match in matches:
+            self.model.edges.append(replace(match, source=number))
+            for k, common, noise in zip((number, match.target), match.common, match.noise, strict=True):
+                one = self.model.kept[k]
+                one.common = common if one.common is None else one.common + common
+                one.noise = (*one.noise[-LOCAL:], noise)
+
+    def _settle(self, number: int, matches: Sequence[PairMatch]) -> None:
+        """Move kept frames to where all pairs want them: those of late, or all of them where a loop closes."""
         model = self.model
         closes = any(number - m.target > LOOP_GAP for m in matches)
         free = [k for k in range(1, number + 1) if closes or k > number - LOCAL]
-        if not free or len(model.edges) < 2:
-            return False
-        maps = [kept.frame.map for kept in model.kept]
-        pivots = Pivots(np.stack([m.centroid for m in maps]), np.array([m.radius for m in maps]))
         near = set(free)
         edges = [e for e in model.edges if e.source in near or e.target in near]
-        used = {k for e in edges for k in (e.source, e.target)}
-        start = {k: model.nodes[k] for k in sorted(used)}
+        if len(edges) < 2:
+            return
+        maps = [kept.frame.map for kept in model.kept]
+        pivots = Pivots(np.stack([m.centroid for m in maps]), np.array([m.radius for m in maps]))
+        start = {k: model.nodes[k] for k in sorted({k for e in edges for k in (e.source, e.target)})}
         model.nodes |= optimise_at_places(edges, pivots, start, free).S_world_camera
-        return True
 
 
 def _first() -> Placed:
     return Placed(State.TRACKED, None, Similarity.identity(), np.zeros((7, 7)), 0.0, 0.0, 1.0, 180.0)
-
-
-def _summed(parts: Sequence[Commonness]) -> Commonness:
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
-    return total
