@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from sl_nerfstudio.calibration.formats import read_device_file
 from sl_nerfstudio.capture.camera import CaptureFolder
 from sl_nerfstudio.decoding.grid import NetworkDecoder
 from sl_nerfstudio.errors import UserError
@@ -23,6 +24,8 @@ from sl_nerfstudio.live.sight import Eye, Sight
 from sl_nerfstudio.live.sources import Shot, Source, require_size
 from sl_nerfstudio.live.tracker import Kept, Model, Placed, Tracker, TrackerState
 from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.pattern.files import read_layout
+from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.processing.captures import CapturedFrame
 from sl_nerfstudio.processing.config import FEWEST_FRAMES
 from sl_nerfstudio.processing.records import DecodedStore, decode, encode
@@ -246,3 +249,19 @@ class Session:
             "changed\n    remedy: give another --output; or give the folder captures/ to sl-scan without --live"
         )
 
+
+
+def open_session(root: Path, source: Source, pattern: Path, intrinsics: Path, work: Path | None = None) -> Session:
+    """A session for the images of a source, with the devices that files describe; they tell the images' size.
+
+    Raises UserError for files that do not fit.
+    """
+    layout = read_layout(pattern)
+    if not isinstance(layout, GridPattern):
+        raise UserError(
+            f"{pattern}: is no coded grid\n    cause:  --live places single images, and Gray code needs several for each "
+            "place\n    remedy: project a coded grid (sl-pattern --kind grid); or capture the sequences with sl-capture"
+        )
+    camera = read_device_file(intrinsics, "camera", source.size)
+    projector = read_device_file(intrinsics, "projector", (layout.w, layout.h))
+    return Session(root, NetworkDecoder(layout), camera, projector, work)

@@ -33,6 +33,11 @@ class Source(Protocol):
 
     name: str
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the images; waits for the first one."""
+        ...
+
     def shots(self, seen: Sequence[str]) -> Iterator[Shot | None]:
         """The images, without those that an earlier run has seen."""
         ...
@@ -47,6 +52,11 @@ class CameraSource:
 
     def __init__(self, camera: Camera | Video) -> None:
         self.name, self._camera = camera.name, camera
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """As the camera says."""
+        return self._camera.size
 
     def shots(self, seen: Sequence[str]) -> Iterator[Shot | None]:
         """A camera has no past; the images of a video are numbered."""
@@ -69,6 +79,20 @@ class FolderSource:
 
     def __init__(self, folder: Path, quiet_s: float = QUIET_S, wait: Callable[[float], None] = time.sleep) -> None:
         self.name, self._folder, self._quiet, self._wait = str(folder), folder, quiet_s, wait
+        self._size: tuple[int, int] | None = None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Of the first image that arrives. Raises UserError if none does."""
+        if self._size is None:
+            first = next((shot for shot in self.shots([]) if shot is not None), None)
+            if first is None:
+                raise UserError(
+                    f"--camera {self._folder}: no image has come\n    cause:  nothing is uploaded into this folder\n"
+                    f"    remedy: let the camera save its pictures there ({', '.join(ENDINGS)})"
+                )
+            self._size = first.image.shape[1], first.image.shape[0]
+        return self._size
 
     def shots(self, seen: Sequence[str]) -> Iterator[Shot | None]:
         """None each time that nothing has come."""
