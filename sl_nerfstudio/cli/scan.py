@@ -61,8 +61,8 @@ class ScanConfig:
     preview: bool = False
     """show in a browser what has been found so far: cameras, projectors and points, then the surface as it trains"""
     live: bool = False
-    """scan with a live model: each image of --camera is placed at once, kept if it adds something, and shown on the page
-    of --preview, which says where to go next; then everything as with photographs"""
+    """scan with a live model: each image of --camera is placed at once, kept if it adds something, and shown on a page
+    that says where to go next; then everything as with photographs"""
     camera: str | None = None
     """for --live: number of the camera (0 is the first), a video file, or a folder that fills up"""
     share: bool = False
@@ -126,22 +126,25 @@ class ScanConfig:
         if not self.live:
             if self.photographs is None:
                 raise UserError(
-                    "no photographs are given\n    cause:  the first word is missing: a folder, a video or a scan folder\n"
+                    "no photographs are given\n"
+                    "    cause:  the first word is missing: a folder, a video or a scan folder\n"
                     "    remedy: give one; or --live with --camera, to scan with a camera"
                 )
             if self.camera is not None:
                 raise UserError(f"--camera {self.camera}: is for --live; give both, or the photographs alone")
         elif self.photographs is not None:
             raise UserError(
-                f"--live: {self.photographs} is given as well\n    cause:  a live scan takes its images from --camera\n"
-                f"    remedy: give --camera {self.photographs} for a video, or a folder that fills up; or leave --live out"
+                f"--live: {self.photographs} is given as well\n"
+                "    cause:  a live scan takes its images from --camera\n"
+                f"    remedy: give --camera {self.photographs} for a video or a folder that fills up; or no --live"
             )
         else:
             for name in ("camera", "pattern", "intrinsics"):
                 if getattr(self, name) is None:
                     raise UserError(
-                        f"{flag_name(name)}: is missing\n    cause:  --live needs to know where images come from, what is "
-                        f"projected, and both devices\n    remedy: give {flag_name(name)}"
+                        f"{flag_name(name)}: is missing\n"
+                        "    cause:  --live needs to know where images come from, what is projected, and both devices\n"
+                        f"    remedy: give {flag_name(name)}"
                     )
             for name in ("masks", "color"):
                 if getattr(self, name) is not None:

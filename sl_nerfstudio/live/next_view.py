@@ -54,7 +54,7 @@ def next_view(model: Model, here: Similarity) -> NextView | None:
     height, heights = directions @ R_up_world[2], kept @ R_up_world[2]
     near = (directions @ kept.T).max(1) > np.cos(np.radians(FARTHEST_DEG))
     allowed = near & (height > heights.min() - LOWER) & (height < heights.max() + HIGHER)
-    best: tuple[float, Float64[ndarray, "3"]] | None = None
+    best: tuple[float, Float64[ndarray, 3]] | None = None
     for direction in directions[allowed]:
         eye = centre + distance * direction
         cosine, seen = _seen(position, normal, eye, centre, surface)
@@ -102,9 +102,7 @@ def _seen(
     return cosine, (cosine > LEAST_COSINE) & (offset @ axis < nearest[place] + HIDDEN * surface.size)
 
 
-def _turn(
-    here: Float64[ndarray, "3"], there: Float64[ndarray, "3"], up: Float64[ndarray, "3"]
-) -> tuple[float, float]:
+def _turn(here: Float64[ndarray, "3"], there: Float64[ndarray, "3"], up: Float64[ndarray, "3"]) -> tuple[float, float]:
     """How far to go to the right, looking at the object, and upwards: degrees about the object."""
     flat = [v - (v @ up) * up for v in (here, there)]
     turn = np.degrees(np.arctan2(up @ np.cross(flat[0], flat[1]), flat[0] @ flat[1]))

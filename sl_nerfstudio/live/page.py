@@ -6,7 +6,6 @@ It is drawn on the page of the preview, which goes on with the pipeline when the
 import base64
 import threading
 from collections.abc import Callable, Sequence
-from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -21,10 +20,10 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import Similarity, centred_on
 from sl_nerfstudio.geometry.triangulation import upright
 from sl_nerfstudio.live.next_view import NextView
+from sl_nerfstudio.live.session import Row, Update
 from sl_nerfstudio.live.sight import Fault, Sight
 from sl_nerfstudio.live.surfels import ENOUGH, Surfels
 from sl_nerfstudio.live.tracker import Doubt, Model, State
-from sl_nerfstudio.live.session import Row, Update
 from sl_nerfstudio.model.preview import Preview
 from sl_nerfstudio.model.scene_nodes import COLOURS, SCENE_SCALE, look_at_object, place, pyramid_size, vertical_fov
 
@@ -45,12 +44,10 @@ _SAYS: dict[Fault | Doubt, tuple[str, str]] = {
     Doubt.RELATIVE_POSE: ("several poses of the projector fit", "move the projector farther from the camera"),
     Doubt.UNCONFIRMED: ("found again, not yet for certain", "stay here for a moment"),
     Doubt.JUMP: ("the camera would have jumped", "move more slowly, or stay here for a moment"),
-    Doubt.NO_OVERLAP: ("this side has not been seen yet", "go back to where the surface on the page is, then slowly on"),
+    Doubt.NO_OVERLAP: ("this side has not been seen yet", "go back to what the page shows, then slowly on"),
     Doubt.TOO_FAST: ("too fast: nothing fits what was seen before", "go back a little, then more slowly"),
-    Doubt.WEAK_START: ("the projector's pose is not clear", "begin with the object in the middle, camera and projector "
-                       "well apart"),
+    Doubt.WEAK_START: ("the projector's pose is not clear", "begin with the object in the middle, both devices apart"),
 }  # fmt: skip
-_STATES = {State.TRACKED: "🟢 tracked", State.UNCERTAIN: "🟡 uncertain", State.LOST: "🔴 lost"}
 _LEAST_WORTH_DEG = 8.0  # of a turn to the next view that is said
 
 # Colours and sizes.
@@ -60,7 +57,9 @@ _VIEW_COLOURS = np.array([[205, 70, 50], [225, 165, 50], [95, 165, 95]], np.floa
 _GHOST = (225, 70, 210)
 _UNCERTAIN_CELLS = 1.0  # sigma over the size of a cell, beyond which a cell is drawn as seen once
 _PICTURE, _PICTURE_QUALITY = 480, 80  # width of the camera's picture, and quality of its JPEG
+_KEPT_SIZE, _NOW_SIZE, _GHOST_SIZE = 0.25, 0.6, 0.8  # of pyramids, over the usual size
 _OVERLAP = 1.5  # size of a drawn cell over its own
+_NARROW, _LOWER = 0.8, 0.5  # width of a window over its height, and by how much its view is moved, scene units
 _LEAST_SHADE = 0.45
 _OUTSIDE = 1.0  # percent of the first surface beyond each side of the box that is looked at
 _ROOM = 1.6  # radius of the scene over that of what the first frame saw
@@ -73,9 +72,10 @@ class LivePage:
         self._preview, self._server, self._devices = preview, preview.server, (camera, projector)
         self._stop = threading.Event()
         self._S_scene_world: Similarity | None = None
-        self._first: Float64[ndarray, "n 4 4"] | None = None  # devices of the first view, in the scene
+        self._first: tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "k 3"]] | None = None  # what is looked at first
         self._nodes: dict[str, viser.SceneNodeHandle] = {}
         self._kept = 0
+        preview.offer_choices(False)
         gui = self._server.gui
         gui.configure_theme(control_layout="collapsible", control_width="medium", show_logo=False)
         self._status = gui.add_markdown("**waiting for the first image**")
@@ -93,6 +93,7 @@ class LivePage:
         """Leave the page to what comes next."""
         for node in (*self._nodes.values(), self._status, self._picture, self._finish):
             node.remove()
+        self._preview.offer_choices(True)
 
     def stopped(self) -> bool:
         """Whether the user has asked for the end."""
@@ -120,7 +121,8 @@ class LivePage:
         turned = Similarity(1.0, upright(cameras), np.zeros(3))
         box = centred_on(turned.points(model.surfels.position), _OUTSIDE)
         self._S_scene_world = Similarity.scaling(1 / _ROOM) @ box @ turned
-        self._first = model.poses.mapped(self._S_scene_world).stacked()
+        surface = self._S_scene_world.points(model.surfels.position)
+        self._first = model.poses.mapped(self._S_scene_world).stacked(), surface[np.linalg.norm(surface, axis=1) < 1]
         for client in self._server.get_clients().values():
             self._look(client)
 
@@ -141,7 +143,7 @@ class LivePage:
             if not isinstance(node, viser.CameraFrustumHandle):
                 camera = self._devices[0]
                 node = scene.add_camera_frustum(
-                    name, vertical_fov(camera), camera.w / camera.h, 0.5 * self._size, color=COLOURS["camera"]
+                    name, vertical_fov(camera), camera.w / camera.h, _KEPT_SIZE * self._size, color=COLOURS["camera"]
                 )
                 self._nodes[name] = node
             place(node, T)
@@ -165,7 +167,7 @@ class LivePage:
             ("camera", "projector"), self._devices, (T_camera, now.poses(relative)), colours, strict=True
         ):
             node = self._server.scene.add_camera_frustum(
-                f"/live/now/{name}", vertical_fov(device), device.w / device.h, 1.3 * self._size, color=colour
+                f"/live/now/{name}", vertical_fov(device), device.w / device.h, _NOW_SIZE * self._size, color=colour
             )
             place(node, S.poses(T))
             self._nodes[f"/live/now/{name}"] = node
@@ -179,7 +181,7 @@ class LivePage:
             return
         T = S.poses(view.T_world_camera)
         ghost = self._server.scene.add_camera_frustum(
-            "/live/next", vertical_fov(camera), camera.w / camera.h, 1.8 * self._size, color=_GHOST
+            "/live/next", vertical_fov(camera), camera.w / camera.h, _GHOST_SIZE * self._size, color=_GHOST
         )
         place(ghost, T)
         self._nodes["/live/next"] = ghost
@@ -189,13 +191,18 @@ class LivePage:
 
     def _look(self, client: viser.ClientHandle) -> None:
         if self._first is not None:
-            look_at_object(client, self._first, None)
+            look_at_object(client, *self._first)
+            if (client.camera.aspect or 1) < _NARROW:  # the panel covers the lower half of a telephone
+                lower = _LOWER * SCENE_SCALE * client.camera.up_direction
+                client.camera.position, client.camera.look_at = (
+                    client.camera.position - lower, client.camera.look_at - lower,
+                )  # fmt: skip
 
 
 def said(update: Update) -> str:
     """State, cause and remedy, where to go, and what there is; for the page and, its first line, for the console."""
     placed, model = update.placed, update.model
-    lines = [f"### {_STATES[placed.state]}"]
+    lines = [f"### {placed.state.value}"]
     if placed.cause is not None:
         problem, remedy = _SAYS[placed.cause]
         lines.append(f"{problem} → **{remedy}**")
@@ -244,8 +251,6 @@ def decoded_picture(sight: Sight) -> UInt8[ndarray, "h w 3"]:
     coords = cv2.resize(sight.cloud.coords, size, interpolation=cv2.INTER_NEAREST)
     xy = coords / np.array([sight.cloud.projector.w, sight.cloud.projector.h], dtype=np.float32)
     return draw_pixels(small, xy, np.isfinite(xy).all(-1))
-
-
 
 
 def picture_text(picture: UInt8[ndarray, "h w 3"]) -> str:

@@ -1,4 +1,4 @@
-"""A live scan from its first image to the last: tracking, the folder of kept frames, and going on after an interruption.
+"""A live scan from its first image to the last: tracking, the folder of kept frames, going on after an interruption.
 
 What is needed to go on is on disk after every image: the same images give the same scan, however often the session was
 interrupted. Kept frames are a folder of captures like any other.
@@ -231,7 +231,10 @@ class Session:
         self.rows = list(state.rows)
         self._eye.factor = state.factor
         frames = [Frame.of(file.cloud) for file in files]
-        kept = [Kept(f, file.cloud.pose.T_camera_projector, file.sigma_position) for f, file in zip(frames, files, strict=True)]
+        kept = [
+            Kept(f, file.cloud.pose.T_camera_projector, file.sigma_position)
+            for f, file in zip(frames, files, strict=True)
+        ]
         self.tracker.resume(state.tracker, kept, [file.matches for file in files])
         if count:
             self._next = next_view(self.tracker.model, self.tracker.model.nodes[count - 1])
@@ -250,7 +253,6 @@ class Session:
         )
 
 
-
 def open_session(root: Path, source: Source, pattern: Path, intrinsics: Path, work: Path | None = None) -> Session:
     """A session for the images of a source, with the devices that files describe; they tell the images' size.
 
@@ -259,8 +261,9 @@ def open_session(root: Path, source: Source, pattern: Path, intrinsics: Path, wo
     layout = read_layout(pattern)
     if not isinstance(layout, GridPattern):
         raise UserError(
-            f"{pattern}: is no coded grid\n    cause:  --live places single images, and Gray code needs several for each "
-            "place\n    remedy: project a coded grid (sl-pattern --kind grid); or capture the sequences with sl-capture"
+            f"{pattern}: is no coded grid\n"
+            "    cause:  --live places single images, and Gray code needs several of each\n"
+            "    remedy: project a coded grid (sl-pattern --kind grid); or capture the sequences with sl-capture"
         )
     camera = read_device_file(intrinsics, "camera", source.size)
     projector = read_device_file(intrinsics, "projector", (layout.w, layout.h))

@@ -1,8 +1,8 @@
 """What one image shows by itself: the surface in front of the camera, or why there is none.
 
 The image is decoded at the size at which the grid can just be read well, and without a look at edges: that is enough to
-know where a frame is, and takes a third of the time. Where that is its full size, what was read is kept, so that decoding
-a kept frame goes on from there.
+know where a frame is, and takes a third of the time. Where that is its full size, what was read is kept: decoding a
+kept frame goes on from there.
 """
 
 from dataclasses import dataclass, replace
@@ -32,12 +32,21 @@ from sl_nerfstudio.scan.images import as_grey
 PERIOD = 8.5  # pixels of the grid at which images are decoded
 PERIOD_REACH = 1.2  # factor by which it may depart from that before the size is changed
 LARGEST_SIDE = 960  # pixels of the longer side at which the grid is looked for, as long as its period is not known
-LATTICE = 240  # pixels of the longer side, about, on which a frame is placed
+LATTICE = 320  # pixels of the longer side, about, on which a frame is placed
 FIT_ROUNDS = 3  # of fitting coordinates to the image, where they are needed for nothing else
 RAYS = RayCounts(fit=4000, polishing=300, ranking=1500)  # by which the relative pose is found
 FINEST_PERIOD = 7.0  # pixels: a finer grid is hardly read, its object is too far away
 FEWEST_POINTS = 300  # of a frame's surface, on the lattice
-WEAK = ("few points", "pure rotation", "small parallax", "planar", "ambiguous", "many outliers", "poor fit", "uncertain")
+WEAK = (
+    "few points",
+    "pure rotation",
+    "small parallax",
+    "planar",
+    "ambiguous",
+    "many outliers",
+    "poor fit",
+    "uncertain",
+)
 
 
 class Fault(Enum):

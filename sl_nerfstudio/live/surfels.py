@@ -62,14 +62,14 @@ class Surfels:
         information = np.bincount(index, 1 / sigma**2) / points
         every = np.union1d(self.key, own)
         old, new = np.searchsorted(every, self.key), np.searchsorted(every, own)
-        out = Surfels(
-            every, np.zeros((len(every), 6)), *np.zeros((2, len(every)), dtype=np.int64), np.zeros(len(every)), self.size
-        )
-        for at, part in ((old, (self.sums, self.points, self.views, self.information)),
-                         (new, (sums, points, np.ones_like(points), information))):  # fmt: skip
-            for whole, values in zip((out.sums, out.points, out.views, out.information), part, strict=True):
-                whole[at] += values
-        return out
+        total, count, views = np.zeros((len(every), 6)), *np.zeros((2, len(every)), dtype=np.int64)
+        known = np.zeros(len(every))
+        total[old], count[old], views[old], known[old] = self.sums, self.points, self.views, self.information
+        total[new] += sums
+        count[new] += points
+        views[new] += 1
+        known[new] += information
+        return Surfels(every, total, count, views, known, self.size)
 
     def thin_share(self, seen: SurfaceMap, S_world_camera: Similarity) -> float:
         """Share of what a frame sees that too few kept frames have seen."""
@@ -77,7 +77,7 @@ class Surfels:
         if not len(key):
             return 0.0
         at = np.searchsorted(self.key, key).clip(max=max(len(self) - 1, 0))
-        known: Bool[ndarray, "m"] = (self.key[at] == key) & (self.views[at] >= ENOUGH) if len(self) else key < 0
+        known: Bool[ndarray, m] = (self.key[at] == key) & (self.views[at] >= ENOUGH) if len(self) else key < 0
         return float(1 - known.mean())
 
 

@@ -263,11 +263,11 @@ class Tracker:
     def _alike(self, frame: Frame, rng: np.random.Generator) -> list[int]:
         """Kept frames that look most like a frame; some of many are compared, others for the next frame."""
         n = len(self.model)
-        some = np.unique((np.arange(min(COMPARED, n)) * n // min(COMPARED, n) + self._count) % n).tolist()
+        some = np.unique([(k * n // min(COMPARED, n) + self._count) % n for k in range(min(COMPARED, n))]).tolist()
         maps = [(frame.map, self.model.kept[k].frame.map) for k in some]
         rngs = rng.spawn(len(some))
         tasks = [partial(search_score, pair, ANYWHERE, one) for pair, one in zip(maps, rngs, strict=True)]
-        order = np.argsort(-np.array(results(tasks)), kind="stable")
+        order = np.argsort([-score for score in results(tasks)], kind="stable")
         return [some[k] for k in order[:PARTNERS]]
 
     def _registered(
