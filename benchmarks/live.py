@@ -251,7 +251,7 @@ def measure(walk: str, recording: Recording, output: Path, full: bool) -> LiveRo
     found = LiveRow(
         walk, len(rows), int(tracked.sum()), int((state == "uncertain").sum()), int((state == "lost").sum()),
         sum(row.kept >= 0 for row in rows), float(np.median(seconds)), float(np.quantile(seconds, 0.9)),
-        cpu / len(rows), *halves, _rms_and_largest(turned), _rms_and_largest(moved),
+        cpu / len(rows), halves[0], halves[1], _rms_and_largest(turned), _rms_and_largest(moved),
         int(((turned > 1) | (moved > 0.01 * distance)).sum()),
     )  # fmt: skip
     return _with_full(found, recording, session) if full else found
@@ -273,7 +273,9 @@ def _with_full(found: LiveRow, recording: Recording, session: Session) -> LiveRo
     truth = recording.truth.T_world_camera[index]
     full, live = camera_errors(T, truth), camera_errors(session.poses[index], truth)
     rms = [_rms_and_largest(errors)[0] for errors in (*full, *live)]
-    return replace(found, full_rotation_deg=rms[0], full_position=rms[1], kept_rotation_deg=rms[2], kept_position=rms[3])
+    return replace(
+        found, full_rotation_deg=rms[0], full_position=rms[1], kept_rotation_deg=rms[2], kept_position=rms[3]
+    )
 
 
 def main() -> None:

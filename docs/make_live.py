@@ -1,4 +1,4 @@
-"""Takes the pictures of docs/live.md: the page of a live scan in Chromium, on a wide and a narrow window, and as a film.
+"""Takes the pictures of docs/live.md: the page of a live scan in Chromium, in a wide and a narrow window, and a film.
 
 .venv/bin/python docs/make_live.py [FOLDER]
 
@@ -27,7 +27,7 @@ from sl_nerfstudio.model.preview import Preview
 WIDE, NARROW = (1100, 760), (420, 760)
 MOMENTS = {6: "begin", 16: "lost", 38: "end"}  # images of the walk after which pictures are taken
 FILM_WIDTH, FILM_MS, FILM_COLOURS = 480, 350, 64
-SETTLE_S = 4.0  # until the page has drawn what it was told
+SETTLE_S, RELOAD_S = 3.0, 12.0  # until the page has drawn what it was told, and until it has begun anew
 
 
 def picture(page: Page) -> Image.Image:
@@ -37,8 +37,10 @@ def picture(page: Page) -> Image.Image:
 
 
 def sized(page: Page, size: tuple[int, int]) -> None:
-    """Give the page another window."""
+    """Open the page anew in a window of another size."""
     page.ask("Emulation.setDeviceMetricsOverride", width=size[0], height=size[1], deviceScaleFactor=1, mobile=False)
+    page.ask("Page.reload")
+    time.sleep(RELOAD_S)
 
 
 def main(words: list[str]) -> None:
@@ -61,7 +63,6 @@ def main(words: list[str]) -> None:
                 if number in MOMENTS:
                     shot.save(PICTURES / f"live-{MOMENTS[number]}.jpg", quality=85)
                     sized(page, NARROW)
-                    time.sleep(SETTLE_S)
                     picture(page).save(PICTURES / f"live-{MOMENTS[number]}-narrow.jpg", quality=85)
                     sized(page, WIDE)
 

@@ -62,6 +62,7 @@ _OVERLAP = 1.5  # size of a drawn cell over its own
 _NARROW, _LOWER = 0.8, 0.5  # width of a window over its height, and by how much its view is moved, scene units
 _LEAST_SHADE = 0.45
 _OUTSIDE = 1.0  # percent of the first surface beyond each side of the box that is looked at
+_WIDER = 1.4  # than what the first frame saw, is what is looked at
 _ROOM = 1.6  # radius of the scene over that of what the first frame saw
 
 
@@ -122,20 +123,20 @@ class LivePage:
         box = centred_on(turned.points(model.surfels.position), _OUTSIDE)
         self._S_scene_world = Similarity.scaling(1 / _ROOM) @ box @ turned
         surface = self._S_scene_world.points(model.surfels.position)
-        self._first = model.poses.mapped(self._S_scene_world).stacked(), surface[np.linalg.norm(surface, axis=1) < 1]
+        self._first = model.poses.mapped(self._S_scene_world).stacked(), _WIDER * surface
         for client in self._server.get_clients().values():
             self._look(client)
 
     def _draw_model(self, model: Model) -> None:
         S, scene = self._S_scene_world, self._server.scene
         assert S is not None
-        surface = model.surfels
+        surface, solid = model.surfels, model.surfels.solid
         placed = model.poses.mapped(S)
         self._size = pyramid_size(placed.T_world_camera)
         towards = model.poses.T_world_camera[-1, :3, 3]
         self._nodes["surface"] = scene.add_point_cloud(
-            "/live/surface", (S.points(surface.position) * SCENE_SCALE).astype(np.float32),
-            cell_colours(surface, towards), S.scale * surface.size * SCENE_SCALE * _OVERLAP, "circle",
+            "/live/surface", (S.points(surface.position[solid]) * SCENE_SCALE).astype(np.float32),
+            cell_colours(surface, towards)[solid], S.scale * surface.size * SCENE_SCALE * _OVERLAP, "circle",
         )  # fmt: skip
         for k, T in enumerate(placed.T_world_camera):
             name = f"/live/kept/{k}"
@@ -215,7 +216,7 @@ def said(update: Update) -> str:
     elif len(model) > 1:
         lines.append(where_to(update.next_view))
     if len(model.surfels):
-        thin = float((model.surfels.views < ENOUGH).mean())
+        thin = float((model.surfels.views[model.surfels.solid] < ENOUGH).mean())
         lines.append(f"{len(model)} frames kept, {1 - thin:.0%} of the surface seen {ENOUGH} times or more")
     lines.append(f"{update.row.seconds:.1f} s a frame")
     return "\n\n".join(lines)

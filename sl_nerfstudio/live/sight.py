@@ -21,7 +21,6 @@ from sl_nerfstudio.decoding.grid_fit import ROUNDS
 from sl_nerfstudio.decoding.grid_phases import clear_places
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.parallel import one_library_thread
-from sl_nerfstudio.processing.video import SHARP, sharpness
 from sl_nerfstudio.registration.evidence import Frame
 from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.candidates import RayCounts
@@ -36,6 +35,7 @@ LATTICE = 320  # pixels of the longer side, about, on which a frame is placed
 FIT_ROUNDS = 3  # of fitting coordinates to the image, where they are needed for nothing else
 RAYS = RayCounts(fit=4000, polishing=300, ranking=1500)  # by which the relative pose is found
 FINEST_PERIOD = 7.0  # pixels: a finer grid is hardly read, its object is too far away
+SMEAR_SIGMA, SMEARED = 1.5, 0.3  # pixels; gradients across the edges' direction over those along it
 FEWEST_POINTS = 300  # of a frame's surface, on the lattice
 WEAK = (
     "few points",
@@ -132,12 +132,20 @@ class Eye:
         return replace(seen, cloud=cloud, frame=Frame.of(cloud), weak=weak)
 
     def _fault(self, grey: Float32[ndarray, "h w"]) -> Fault:
-        """Why an image shows no grid; motion blurs in one direction only, which the edges in the other do not show."""
+        """Why an image shows no grid; motion blurs in one direction, and the edges of the other stay sharp."""
         nothing = np.full((*self._selection.shape, 2), np.nan, dtype=np.float32)
         view = GridView(nothing, float("nan"), None, measure_light(grey), edge_width(grey))
         fault = _FAULTS.get(self._selection.judge(view, 0.0), Fault.NO_PATTERN)
-        moved = fault is Fault.NO_PATTERN and sharpness(np.rint(255 * grey).astype(np.uint8)) < SHARP
-        return Fault.BLURRED if moved else fault
+        return Fault.BLURRED if fault is Fault.NO_PATTERN and is_smeared(grey) else fault
+
+
+def is_smeared(grey: Float32[ndarray, "h w"]) -> bool:
+    """Whether nearly all edges have one direction, by the eigenvalues of the structure tensor: a grid has two."""
+    smooth = cv2.GaussianBlur(grey, (0, 0), SMEAR_SIGMA)
+    x, y = (cv2.Sobel(smooth, cv2.CV_32F, *order) for order in ((1, 0), (0, 1)))
+    tensor = np.array([[(x * x).mean(), (x * y).mean()], [(x * y).mean(), (y * y).mean()]])
+    small, large = np.linalg.eigvalsh(tensor)
+    return bool(small < SMEARED * large)
 
 
 def sampled(camera: Device, step: int) -> Device:

@@ -10,6 +10,7 @@ from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.registration.surfaces import SurfaceMap
 
 CELLS = 24.0  # along the RMS radius of what the first frame saw
+LEAST_FILLED = 0.3  # points of a cell, relative to the median
 ENOUGH = 3  # kept views of a cell
 _SHIFT = 1 << 19  # cells on each side of the origin that a key has room for
 
@@ -41,6 +42,11 @@ class Surfels:
         """Mean direction, unit length."""
         n = self.sums[:, 3:]
         return n / np.linalg.norm(n, axis=1, keepdims=True).clip(1e-300)
+
+    @property
+    def solid(self) -> Bool[ndarray, "n"]:
+        """Cells through whose middle the surface goes; those whose corners it cuts hold few points."""
+        return self.points >= LEAST_FILLED * np.median(self.points) if len(self) else np.zeros(0, dtype=bool)
 
     @property
     def sigma(self) -> Float64[ndarray, "n"]:

@@ -37,6 +37,7 @@ PARTNERS = 3  # kept frames with which each frame is registered
 OTHERS = 5  # kept frames around those, by which a place is judged as well
 RECENT = 8  # kept frames of late: one partner is older, where there is one, so that loops close
 LEAST_FACING = 0.5  # cosine between lines of sight of a frame and a partner
+NEAR_AFTER = 2  # frames without a certain place, after which it is looked for everywhere first
 COMPARED = 10  # kept frames of which those that look most like a frame are partners, when it is lost
 LEAST_CONFIRMING = 2  # pairs, or frames one after the other, that must say a place after a loss
 LARGEST_JUMP_DEG = 40.0  # that a camera turns about the object from one frame to the next without being lost
@@ -236,13 +237,13 @@ class Tracker:
         if not len(self.model):
             return Placed(State.LOST, Doubt.WEAK_START) if sight.weak else _first()
         rng = np.random.default_rng([self._seed, self._count])
-        guess = self._last if self._lost == 0 else None
+        guess = self._last if self._lost <= NEAR_AFTER else None
         placed = self._registered(sight, self._near(guess), guess, rng) if guess is not None else None
         if placed is None or placed.state is State.LOST:
             placed = self._registered(sight, self._alike(sight.frame, rng), None, rng)
         if len(self.model) > 1 or placed.state is State.TRACKED:
             return placed
-        self._misfits += placed.state is State.LOST
+        self._misfits += 1
         if self._misfits < BEFORE_RESTART or sight.weak:
             return placed
         self.model, self._misfits = Model(), 0  # one of two frames is wrong: the scan has hardly begun
