@@ -1,4 +1,4 @@
-"""Tracking: a walk comes back to where it began, a loss is said and ends, and nothing is certain that may be elsewhere."""
+"""Tracking: a walk comes back to where it began, a loss is said and ends, and what may be elsewhere is not certain."""
 
 import numpy as np
 import pytest
