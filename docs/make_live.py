@@ -26,7 +26,7 @@ from sl_nerfstudio.model.preview import Preview
 
 WIDE, NARROW = (1100, 760), (420, 760)
 MOMENTS = {6: "begin", 16: "lost", 38: "end"}  # images of the walk after which pictures are taken
-FILM_WIDTH, FILM_MS, FILM_COLOURS = 480, 350, 64
+FILM_WIDTH, FILM_MS, FILM_COLOURS = 400, 350, 32
 SETTLE_S, RELOAD_S = 3.0, 12.0  # until the page has drawn what it was told, and until it has begun anew
 
 
@@ -68,7 +68,8 @@ def main(words: list[str]) -> None:
 
             session.run(source, watch)
     frames = [shot.quantize(FILM_COLOURS) for shot in film]
-    frames[0].save(PICTURES / "live.gif", save_all=True, append_images=frames[1:], duration=FILM_MS, loop=0)
+    frames[0].save(PICTURES / "live.gif", save_all=True, append_images=frames[1:], duration=FILM_MS, loop=0,
+                   optimize=True)  # fmt: skip
 
 
 if __name__ == "__main__":

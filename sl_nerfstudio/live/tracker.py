@@ -252,8 +252,8 @@ class Tracker:
     def _near(self, S_world_camera: Similarity) -> list[int]:
         """Kept frames that look the same way as a camera: the nearest, and one that is older."""
         numbers = list(self.model.nodes)
-        sight = np.array([S.R[:, 2] for S in self.model.nodes.values()])
-        cosine = sight @ S_world_camera.R[:, 2]
+        sight = np.array([S.R[:, 2] for S in self.model.nodes.values()], dtype=np.float64)
+        cosine = sight @ np.asarray(S_world_camera.R[:, 2], dtype=np.float64)
         order = [numbers[k] for k in np.argsort(-cosine, kind="stable") if cosine[k] > LEAST_FACING]
         chosen = order[:PARTNERS]
         old = [k for k in order if k < len(numbers) - RECENT]
