@@ -32,12 +32,24 @@ class NextView:
 
     T_world_camera: Float64[ndarray, "4 4"]
     gain: float  # nats, of all cells together
-    right_deg: float  # from where the camera is, about the object, as the user sees it
-    up_deg: float
+    centre: Float64[ndarray, "3"]  # of the object
+    up: Float64[ndarray, "3"]
+
+    def way_from(self, here: Similarity) -> tuple[float, float]:
+        """How far to go to the right and upwards from a camera (`S_world_camera`): degrees about the object.
+
+        As the user sees it, who looks at the object.
+        """
+        reach = np.stack([here.t - self.centre, self.T_world_camera[:3, 3] - self.centre])
+        height = reach @ self.up
+        flat = reach - height[:, None] * self.up
+        turn = np.degrees(np.arctan2(self.up @ np.cross(flat[0], flat[1]), flat[0] @ flat[1]))
+        elevation = np.degrees(np.arcsin(np.clip(height / np.linalg.norm(reach, axis=1), -1, 1)))
+        return float(turn), float(elevation[1] - elevation[0])
 
 
-def next_view(model: Model, here: Similarity) -> NextView | None:
-    """The best of all candidates, seen from a camera (`S_world_camera`); None where no view adds much."""
+def next_view(model: Model) -> NextView | None:
+    """The best of all candidates; None where no view adds much."""
     surface = model.surfels
     if not len(surface):
         return None
@@ -69,8 +81,7 @@ def next_view(model: Model, here: Similarity) -> NextView | None:
     T[:3, 0] = np.cross(up, T[:3, 2])
     T[:3, 0] /= max(np.linalg.norm(T[:3, 0]), 1e-9)
     T[:3, 1], T[:3, 3] = np.cross(T[:3, 2], T[:3, 0]), best[1]
-    right, above = _turn(here.t - centre, best[1] - centre, up)
-    return NextView(T, step * best[0], right, above)
+    return NextView(T, step * best[0], centre, up)
 
 
 def _around() -> Float64[ndarray, "k 3"]:
@@ -100,11 +111,3 @@ def _seen(
     nearest = np.full(DEPTH_IMAGE**2, np.inf)
     np.minimum.at(nearest, place, offset @ axis)
     return cosine, (cosine > LEAST_COSINE) & (offset @ axis < nearest[place] + HIDDEN * surface.size)
-
-
-def _turn(here: Float64[ndarray, "3"], there: Float64[ndarray, "3"], up: Float64[ndarray, "3"]) -> tuple[float, float]:
-    """How far to go to the right, looking at the object, and upwards: degrees about the object."""
-    flat = [v - (v @ up) * up for v in (here, there)]
-    turn = np.degrees(np.arctan2(up @ np.cross(flat[0], flat[1]), flat[0] @ flat[1]))
-    elevation = [np.degrees(np.arcsin(np.clip(v @ up / np.linalg.norm(v), -1, 1))) for v in (here, there)]
-    return float(turn), float(elevation[1] - elevation[0])

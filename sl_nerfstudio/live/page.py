@@ -214,7 +214,7 @@ def said(update: Update) -> str:
     if placed.state is State.LOST and len(model):
         lines.append("to come back: show a part of the surface that is on the page already")
     elif len(model) > 1:
-        lines.append(where_to(update.next_view))
+        lines.append(where_to(update.next_view, placed.S_world_camera))
     if len(model.surfels):
         thin = float((model.surfels.views[model.surfels.solid] < ENOUGH).mean())
         lines.append(f"{len(model)} frames kept, {1 - thin:.0%} of the surface seen {ENOUGH} times or more")
@@ -222,12 +222,14 @@ def said(update: Update) -> str:
     return "\n\n".join(lines)
 
 
-def where_to(view: NextView | None) -> str:
-    """The way to the next view, as the user goes who looks at the object."""
+def where_to(view: NextView | None, here: Similarity | None) -> str:
+    """The way to the next view from where the camera is, as the user goes who looks at the object."""
     if view is None:
         return "the surface is known well from all sides that can be seen from here: finish, or look below and above"
-    parts = []
-    for angle, more, less in ((view.right_deg, "to the right", "to the left"), (view.up_deg, "higher", "lower")):
+    if here is None:
+        return ""
+    (right, above), parts = view.way_from(here), []
+    for angle, more, less in ((right, "to the right", "to the left"), (above, "higher", "lower")):
         if abs(angle) >= _LEAST_WORTH_DEG:
             parts.append(f"{abs(angle):.0f}° {more if angle > 0 else less}")
     return f"next: **{', '.join(parts) or 'stay here a little longer'}**"

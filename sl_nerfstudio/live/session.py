@@ -157,7 +157,7 @@ class Session:
         number = self.tracker.keep(sight, placed) if placed.adds and sight.sharp else -1
         model = self.tracker.model
         if number >= 0:
-            self._next = next_view(model, model.nodes[number])
+            self._next = next_view(model)
             anchor, S_anchor_camera = number, Similarity.identity()
         else:
             anchor, S_anchor_camera = placed.anchor, placed.S_anchor_camera
@@ -237,7 +237,7 @@ class Session:
         ]
         self.tracker.resume(state.tracker, kept, [file.matches for file in files])
         if count:
-            self._next = next_view(self.tracker.model, self.tracker.model.nodes[count - 1])
+            self._next = next_view(self.tracker.model)
 
     def _kept_file(self, number: int) -> KeptFile:
         content = read_checked(self._kept_path(number))

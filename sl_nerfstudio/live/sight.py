@@ -32,8 +32,8 @@ PERIOD = 8.5  # pixels of the grid at which images are decoded
 PERIOD_REACH = 1.2  # factor by which it may depart from that before the size is changed
 LARGEST_SIDE = 960  # pixels of the longer side at which the grid is looked for, as long as its period is not known
 LATTICE = 320  # pixels of the longer side, about, on which a frame is placed
-FIT_ROUNDS = 3  # of fitting coordinates to the image, where they are needed for nothing else
-RAYS = RayCounts(fit=4000, polishing=300, ranking=1500)  # by which the relative pose is found
+FIT_ROUNDS = 4  # of fitting coordinates to the image, where they are needed for nothing else
+RAYS = RayCounts(fit=16000, polishing=300, ranking=1500)  # by which the relative pose is found
 FINEST_PERIOD = 7.0  # pixels: a finer grid is hardly read, its object is too far away
 SMEAR_SIGMA, SMEARED = 1.5, 0.3  # pixels; gradients across the edges' direction over those along it
 FEWEST_POINTS = 300  # of a frame's surface, on the lattice

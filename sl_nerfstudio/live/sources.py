@@ -2,10 +2,10 @@
 
 import os
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 from jaxtyping import UInt8
 from numpy import ndarray
@@ -28,26 +28,26 @@ class Shot:
     image: UInt8[ndarray, "h w 3"]
 
 
-class Source(Protocol):
+class Source(ABC):
     """Gives images one after the other; None while there is nothing new."""
 
     name: str
 
     @property
+    @abstractmethod
     def size(self) -> tuple[int, int]:
         """Width and height of the images; waits for the first one."""
-        ...
 
+    @abstractmethod
     def shots(self, seen: Sequence[str]) -> Iterator[Shot | None]:
         """The images, without those that an earlier run has seen."""
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Let go of the source."""
-        ...
 
 
-class CameraSource:
+class CameraSource(Source):
     """The newest image of a camera, or every so-manieth image of a video."""
 
     def __init__(self, camera: Camera | Video) -> None:
@@ -71,7 +71,7 @@ class CameraSource:
         self._camera.close()
 
 
-class FolderSource:
+class FolderSource(Source):
     """The images of a folder in the order in which they arrived, also of those that come later.
 
     An image is read when its file has stopped growing. The folder is complete when nothing has come for some time.

@@ -29,8 +29,15 @@ def tracker():
 def update(tracker, sight, placed, number=-1) -> Update:
     cause = "" if placed.cause is None else placed.cause.value
     row = Row("image 7", placed.state.value, cause, number, -1, 0.5, 0.1, 0.01, None)
-    view = NextView(np.eye(4), 5.0, 30.0, -20.0)
-    return Update(sight, placed, row, [row], tracker.model, view)
+    return Update(sight, placed, row, [row], tracker.model, view_at(30.0, 20.0))
+
+
+def view_at(turn_deg: float, elevation_deg: float) -> NextView:
+    """A view of the origin from a turn to the right of the x axis, seen by who looks at the origin; z is up."""
+    a, b = np.radians([turn_deg, elevation_deg])
+    T = np.eye(4)
+    T[:3, 3] = 3 * np.cos(b) * np.cos(a), 3 * np.cos(b) * np.sin(a), 3 * np.sin(b)
+    return NextView(T, 5.0, np.zeros(3), np.array([0.0, 0.0, 1.0]))
 
 
 @pytest.mark.parametrize("cause", [*Fault, *Doubt])
@@ -41,10 +48,10 @@ def test_every_cause_is_said_with_what_to_do(tracker, cause):
 
 
 def test_the_way_to_the_next_view_is_said_in_the_users_directions():
-    view = NextView(np.eye(4), 5.0, 30.0, -20.0)
-    assert where_to(view) == "next: **30° to the right, 20° lower**"
-    assert where_to(replace(view, right_deg=-12.0, up_deg=3.0)) == "next: **12° to the left**"
-    assert "finish" in where_to(None)
+    here = Similarity(1.0, np.eye(3), np.array([5.0, 0.0, 0.0]))
+    assert where_to(view_at(30.0, -20.0), here) == "next: **30° to the right, 20° lower**"
+    assert where_to(view_at(-12.0, 3.0), here) == "next: **12° to the left**"
+    assert "finish" in where_to(None, here)
 
 
 def test_cells_seen_once_are_red_and_those_seen_often_green(tracker):

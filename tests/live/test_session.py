@@ -53,6 +53,7 @@ def test_frames_that_add_something_are_kept_as_captures(whole):
     assert np.isfinite(session.poses).all((1, 2)).tolist() == [place != AWAY for place in WALK]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cut", [1, 4, 8])
 def test_a_session_that_was_interrupted_gives_the_same_scan(whole, tmp_path, cut):
     with pytest.raises(KeyboardInterrupt):
@@ -65,6 +66,7 @@ def test_a_session_that_was_interrupted_gives_the_same_scan(whole, tmp_path, cut
     assert files[0] == files[1]
 
 
+@pytest.mark.slow
 def test_an_image_that_was_kept_but_not_noted_comes_again(whole, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setattr(Session, "_note", lambda self: 1 / (len(self.rows) - 3) and _note(self))

@@ -42,6 +42,7 @@ def lap():
     return tracker, walk(tracker, sights())
 
 
+@pytest.mark.slow
 def test_a_walk_around_the_object_comes_back_to_where_it_began(lap):
     tracker, found = lap
     states = [placed.state for placed in found]
@@ -54,6 +55,7 @@ def test_a_walk_around_the_object_comes_back_to_where_it_began(lap):
     assert any(target < 4 and source > len(kept) - 4 for target, source in first_and_last)  # the loop was closed
 
 
+@pytest.mark.slow
 def test_stated_uncertainty_covers_the_errors_against_the_frames_around(lap):
     _, found = lap
     kept, ratios = kept_places(found, range(len(found))), []
@@ -104,6 +106,7 @@ def test_a_ball_is_never_certain():
     assert len(tracker.model) == 1
 
 
+@pytest.mark.slow
 def test_a_first_frame_that_nothing_fits_is_given_up():
     tracker = Tracker()
     ball = seen(on_a_ball(sights()[12].cloud, 0.3, "something else"))
@@ -116,6 +119,7 @@ def test_a_first_frame_that_nothing_fits_is_given_up():
         assert turn_deg(relative.numpy(), S.R) < 0.5
 
 
+@pytest.mark.slow
 def test_the_same_frames_give_the_same_places(lap):
     again = Tracker()
     for before, now in zip(lap[1], walk(again, sights()[:4]), strict=False):

@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 
 from sl_nerfstudio.live.sight import Fault, Sight
-from sl_nerfstudio.live.sources import Shot
+from sl_nerfstudio.live.sources import Shot, Source
 from sl_nerfstudio.registration.evidence import Frame
 from sl_nerfstudio.registration.surfaces import FrameCloud
 from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, rig_of
@@ -52,13 +52,16 @@ class FakeEye:
 
 
 @dataclass
-class FakeSource:
+class FakeSource(Source):
     """Gives images of places, and fails after some of them if it is told to."""
 
     places: Sequence[int]
     fails_after: int | None = None
     name: str = "walk"
-    size: tuple[int, int] = (SIZE, SIZE)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return SIZE, SIZE
 
     def shots(self, seen: Sequence[str]) -> Iterator[Shot | None]:
         for number, place in enumerate(self.places):
