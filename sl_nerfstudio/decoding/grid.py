@@ -14,7 +14,7 @@ from numpy import ndarray
 from sl_nerfstudio.decoding.decoder import Decoded, Decoder, drop_small_regions, torn
 from sl_nerfstudio.decoding.grid_detection import LEAST_NODES, DetectedGrid, GridDetector, refusal
 from sl_nerfstudio.decoding.grid_edges import Chosen, EdgeChooser, EdgeEvidence, load_edge_network, weight_files
-from sl_nerfstudio.decoding.grid_fit import ROUNDS, DrawnGrid, draw_sharpnesses, fit_densely
+from sl_nerfstudio.decoding.grid_fit import DrawnGrid, draw_sharpnesses, fit_densely
 from sl_nerfstudio.decoding.grid_graph import symbol_log_ratio
 from sl_nerfstudio.decoding.grid_phases import (
     LEAST_MASK,
@@ -143,11 +143,8 @@ class GridImageDecoder:
             factor //= 2
         return None
 
-    def examine(self, grey: Float32[ndarray, "h w"], found: DetectedGrid, rounds: int = ROUNDS) -> EdgeEvidence:
-        """Coordinates of all pixels that a node reaches, and what tells the right ones from the wrong ones.
-
-        With fewer `rounds`, they are fitted to the image a little less closely.
-        """
+    def examine(self, grey: Float32[ndarray, "h w"], found: DetectedGrid) -> EdgeEvidence:
+        """Coordinates of all pixels that a node reaches, and what tells the right ones from the wrong ones."""
         assignment, known = found.assignment, found.assignment.known
         phases = sample_pixels(found.maps, found.rectified, (grey.shape[0], grey.shape[1]))
         at = np.floor(to_pixel_coordinates(found.graph.place[known], found.rectified)).astype(np.int32)
@@ -159,7 +156,7 @@ class GridImageDecoder:
         read = to_pattern(turned, self.pattern, assignment.turn)
         read[~self._inside(read)] = np.nan
         trust = np.clip((phases.probability - LEAST_MASK) / (1 - LEAST_MASK), _LEAST_TRUST, 1).astype(np.float32)
-        fitted, agreement = fit_densely(grey, read, trust, self.drawn, found.appearance.period, rounds)
+        fitted, agreement = fit_densely(grey, read, trust, self.drawn, found.appearance.period)
         return EdgeEvidence(read, fitted, agreement, log_ratio, phases.probability)
 
     def _select(self, chosen: Chosen, pixels_a_period: float) -> Float32[ndarray, "h w 2"]:

@@ -324,7 +324,7 @@ _TEAR = 0.35  # periods between neighbouring pixels
 _LEAST_AREA = 1.0  # smaller regions are left out, periods squared
 # Iteration.
 _WINDOW = 0.42  # of a shift, periods
-ROUNDS = 6  # each recovers a part of the detail that the window of the fit averages over
+_ROUNDS = 6  # each recovers a part of the detail that the window of the fit averages over
 _SMOOTHING = ((0.35, 0.05), (0.12, 0.1))  # windows in which coordinates are taken to be linear, and how far from them
 # the pixel's own may be for that; periods
 _LARGEST_SHIFT = 0.12  # periods, of all rounds together
@@ -336,7 +336,6 @@ def fit_densely(
     trust: Float32[ndarray, "h w"],
     grids: tuple[DrawnGrid, ...],
     pixels_a_period: float,
-    rounds: int = ROUNDS,
 ) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
     """Refined coordinates in pattern pixels, and the correlation of pattern and image there (-1 to 1).
 
@@ -347,7 +346,7 @@ def fit_densely(
     agreement = np.zeros(image.shape, dtype=np.float32)
     least = _LEAST_AREA * pixels_a_period**2
     for box, inside in large_regions(coords, _TEAR * grids[0].period, least):
-        values, fit = _refine(image[box], coords[box], trust[box] * inside, inside, grids, pixels_a_period, rounds)
+        values, fit = _refine(image[box], coords[box], trust[box] * inside, inside, grids, pixels_a_period)
         out[box][inside], agreement[box][inside] = values[inside], fit[inside]
     return out, agreement
 
@@ -359,7 +358,6 @@ def _refine(
     inside: Bool[ndarray, "h w"],
     grids: tuple[DrawnGrid, ...],
     pixels_a_period: float,
-    rounds: int,
 ) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
     """A few rounds of fitting shifts, with the sharpness that agrees best with the image.
 
@@ -373,7 +371,7 @@ def _refine(
     fits = [fit_shift(image, coords, trust, grid, even, pixels_a_period, _WINDOW) for grid in grids]
     best = int(np.argmax([fit.agreement[inside].mean() for fit in fits]))
     shift, light = fits[best].shift, measure_light(image, coords, trust, grids[best], pixels_a_period)
-    for index in range(rounds):
+    for index in range(_ROUNDS):
         moved = coords + shift * np.float32(period) - start
         limit = np.float32(_LARGEST_SHIFT * period)
         coords = start + np.clip(moved, -limit, limit)

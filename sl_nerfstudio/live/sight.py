@@ -17,7 +17,6 @@ from sl_nerfstudio.capture.selection import DEFAULT_LIMITS, GridView, Selection,
 from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.grid import FirstLook, NetworkDecoder
 from sl_nerfstudio.decoding.grid_detection import edge_width, line_blur
-from sl_nerfstudio.decoding.grid_fit import ROUNDS
 from sl_nerfstudio.decoding.grid_phases import clear_places
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.parallel import one_library_thread
@@ -32,7 +31,6 @@ PERIOD = 8.5  # pixels of the grid at which images are decoded
 PERIOD_REACH = 1.2  # factor by which it may depart from that before the size is changed
 LARGEST_SIDE = 960  # pixels of the longer side at which the grid is looked for, as long as its period is not known
 LATTICE = 320  # pixels of the longer side, about, on which a frame is placed
-FIT_ROUNDS = 4  # of fitting coordinates to the image, where they are needed for nothing else
 RAYS = RayCounts(fit=16000, polishing=300, ranking=1500)  # by which the relative pose is found
 FINEST_PERIOD = 7.0  # pixels: a finer grid is hardly read, its object is too far away
 SMEAR_SIGMA, SMEARED = 1.5, 0.3  # pixels; gradients across the edges' direction over those along it
@@ -111,8 +109,7 @@ class Eye:
             self.factor = min(self._largest, factor * PERIOD / period)
         blur = line_blur(found.rectified, found.maps, clear_places(found.maps), self.decoder.layout)
         sharp = blur is not None and blur < DEFAULT_LIMITS.most_blur
-        rounds = FIT_ROUNDS if factor < 1 else ROUNDS
-        first = FirstLook(grey, found, self.decoder.images.examine(grey, found, rounds))
+        first = FirstLook(grey, found, self.decoder.images.examine(grey, found))
         seen = Sight(image, first if factor == 1 else None, period=period / factor, sharp=sharp)
         step = max(1, round(max(camera.w, camera.h) / LATTICE))
         part = slice(step // 2, None, step)
