@@ -630,7 +630,7 @@ class GrowingArray:
         first = self._file is None
         try:
             if self._file is None:
-                self._file = tempfile.TemporaryFile()  # `whole` closes it
+                self._file = tempfile.TemporaryFile()  # noqa: SIM115  # `whole` closes it
             for piece in self._pieces:
                 self._file.write(piece.tobytes())
         except OSError as error:

@@ -96,7 +96,7 @@ def _tile(vectors: int) -> Any:
     rows, columns = range(ROWS), range(vectors)
 
     @intrinsic
-    def tile(typing: Any, a: Any, a0: Any, a_i: Any, a_k: Any, b: Any, b0: Any, b_k: Any, c: Any, c0: Any, c_i: Any, depth: Any, add: Any):  # fmt: skip
+    def tile(typing: Any, a: Any, a0: Any, a_i: Any, a_k: Any, b: Any, b0: Any, b_k: Any, c: Any, c0: Any, c_i: Any, depth: Any, add: Any):  # fmt: skip  # noqa: E501
         n = types.int64
         signature = types.void(a, n, n, n, b, n, n, c, n, n, n, types.boolean)
 
@@ -225,9 +225,9 @@ def gather(typing: Any, table: Any, corners: Any, t: Any, weight: Any, out: Any,
 
 
 @intrinsic
-def gather_jacobian(typing: Any, table: Any, corners: Any, t: Any, weight: Any, out: Any, position: Any, slope: Any, jacobian: Any, at: Any, stride: Any):  # fmt: skip
+def gather_jacobian(typing: Any, table: Any, corners: Any, t: Any, weight: Any, out: Any, position: Any, slope: Any, jacobian: Any, at: Any, stride: Any):  # fmt: skip  # noqa: E501
     """`gather`, and also `jacobian[at + axis * stride:] = slope[axis] * d trilinear / d t[axis]` for all three axes."""
-    signature = types.void(table, corners, t, types.float32, out, types.int64, slope, jacobian, types.int64, types.int64)  # fmt: skip
+    signature = types.void(table, corners, t, types.float32, out, types.int64, slope, jacobian, types.int64, types.int64)  # fmt: skip  # noqa: E501
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         table, corners, t, weight, out, position, slope, jacobian, at, stride = args

@@ -334,7 +334,7 @@ _STEPS = 2**30  # of the largest extent: coordinates are whole numbers
 def require_laspy(path: Path) -> None:
     """Raise UserError if laspy is not installed."""
     try:
-        import laspy
+        import laspy  # noqa: F401
     except ImportError as error:
         raise UserError(
             f"{path}: LAS files need the package laspy\n"
