@@ -102,14 +102,14 @@ def flags_of(kind: type) -> Iterator[Flag]:
         if dataclasses.is_dataclass(bare):
             yield from flags_of(bare)  # type: ignore[arg-type]
             continue
-        required = default in (dataclasses.MISSING, tyro.MISSING)
+        positional = tyro.conf.Positional in getattr(hint, "__metadata__", ())
+        required = positional or default in (dataclasses.MISSING, tyro.MISSING)
         text = texts[field.name]
         if not (required or default is None or isinstance(default, bool) or default == () or "default:" in text):
             said = " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
             text += f" (default: {said})"
         name = flag_name(f"no_{field.name}" if default is True else field.name)
         values = "" if bare is bool else _values(hint)
-        positional = tyro.conf.Positional in getattr(hint, "__metadata__", ())
         yield Flag(field.name, values if positional else f"{name} {values}".strip(), text, required)
 
 

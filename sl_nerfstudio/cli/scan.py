@@ -34,10 +34,10 @@ class ScanConfig:
     added later takes no training. With a scan folder in place of the photographs, it begins with the training.
     """
 
-    photographs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOGRAPHS|SCAN")]
+    photographs: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOGRAPHS|SCAN")] = None
     """folder of the photographs, one for each frame or one sub-folder for each Gray-code sequence; a video; or a scan
-    folder, which holds transforms.json"""
-    output: Path
+    folder, which holds transforms.json; none with --live"""
+    output: Path = tyro.MISSING
     """folder for all results: a new one, or one that this command has begun"""
     pattern: Path | None = None
     """pattern.json of the projected pattern, as written by sl-pattern or sl-synth; needed for photographs"""
@@ -60,17 +60,29 @@ class ScanConfig:
     """draft: a fifth of the training and coarse cells; fine: three times the training and finer cells"""
     preview: bool = False
     """show in a browser what has been found so far: cameras, projectors and points, then the surface as it trains"""
+    live: bool = False
+    """scan with a live model: each image of --camera is placed at once, kept if it adds something, and shown on a page
+    that says where to go next; then everything as with photographs"""
+    camera: str | None = None
+    """for --live: number of the camera (0 is the first), a video file, or a folder that fills up"""
+    share: bool = False
+    """let others in the network open the page of --live or --preview, such as a telephone"""
 
     @property
     def is_scan(self) -> bool:
         """Whether a scan folder is given instead of photographs."""
-        return (self.photographs / "transforms.json").is_file()
+        return (self.captures / "transforms.json").is_file()
+
+    @property
+    def captures(self) -> Path:
+        """What the scan is made from: the given folder or video, or the frames that a live scan keeps."""
+        return self.output / LIVE / "captures" if self.photographs is None else self.photographs
 
     @property
     def words(self) -> list[str]:
         """The words of this command, to copy and for the record; without `--preview`, on which no result depends."""
-        found = ["sl-scan", str(self.photographs)]
-        plain = replace(self, preview=False)
+        found = ["sl-scan", *([] if self.photographs is None else [str(self.photographs)])]
+        plain = replace(self, preview=False, share=False)
         for field in fields(plain)[1:]:
             value = getattr(plain, field.name)
             if field.default is MISSING or value != field.default:
@@ -86,27 +98,62 @@ class ScanConfig:
 
     def check(self) -> None:
         """Raise UserError for flags that do not belong together."""
+        self._check_live()
         if self.is_scan:
             names = ("pattern", "intrinsics", "known_length", "masks", "color")
             given = [flag_name(name) for name in names if getattr(self, name) is not None]
             given += ["--full-size"] if self.full_size else []
             if given:
                 raise UserError(
-                    f"{', '.join(given)}: {self.photographs} is a scan folder, which states all of that itself\n"
+                    f"{', '.join(given)}: {self.captures} is a scan folder, which states all of that itself\n"
                     "    cause:  these flags are for photographs\n"
                     "    remedy: leave them out, or give the folder of the photographs"
                 )
         elif self.pattern is None:
             raise UserError(
-                f"--pattern: is missing\n    cause:  {self.photographs} has no transforms.json, so it is taken for "
+                f"--pattern: is missing\n    cause:  {self.captures} has no transforms.json, so it is taken for "
                 "photographs\n    remedy: give the pattern.json of what was projected; or give a scan folder"
             )
-        outer, inner = (os.path.realpath(path) for path in (self.photographs, self.output))
+        outer, inner = (os.path.realpath(path) for path in (self.captures, self.output))
         if os.path.commonpath([outer, inner]) == outer:
             raise UserError(
-                f"--output {self.output}: is in {self.photographs}, and would become one of the captures\n"
+                f"--output {self.output}: is in {self.captures}, and would become one of the captures\n"
                 f"    remedy: give a folder outside of it, such as {Path(outer).parent / 'result'}"
             )
+
+    def _check_live(self) -> None:
+        """Raise UserError for flags that a live scan lacks, or that have no meaning for it."""
+        if not self.live:
+            if self.photographs is None:
+                raise UserError(
+                    "no photographs are given\n"
+                    "    cause:  the first word is missing: a folder, a video or a scan folder\n"
+                    "    remedy: give one; or --live with --camera, to scan with a camera"
+                )
+            if self.camera is not None:
+                raise UserError(f"--camera {self.camera}: is for --live; give both, or the photographs alone")
+        elif self.photographs is not None:
+            raise UserError(
+                f"--live: {self.photographs} is given as well\n"
+                "    cause:  a live scan takes its images from --camera\n"
+                f"    remedy: give --camera {self.photographs} for a video or a folder that fills up; or no --live"
+            )
+        else:
+            for name in ("camera", "pattern", "intrinsics"):
+                if getattr(self, name) is None:
+                    raise UserError(
+                        f"{flag_name(name)}: is missing\n"
+                        "    cause:  --live needs to know where images come from, what is projected, and both devices\n"
+                        f"    remedy: give {flag_name(name)}"
+                    )
+            for name in ("masks", "color"):
+                if getattr(self, name) is not None:
+                    raise UserError(
+                        f"{flag_name(name)}: is named like the frames, which --live has yet to choose\n"
+                        f"    remedy: leave it out; later give {self.captures} without --live, and {flag_name(name)}"
+                    )
+        if self.share and not (self.live or self.preview):
+            raise UserError("--share: there is no page to share; give --live or --preview as well")
 
     def processing(self) -> "ProcessConfig":
         """What sl-process is asked for."""
@@ -114,7 +161,7 @@ class ScanConfig:
 
         assert self.pattern is not None
         return ProcessConfig(
-            self.photographs, self.pattern, self.intrinsics, self.output / "scan", known_length=self.known_length,
+            self.captures, self.pattern, self.intrinsics, self.output / "scan", known_length=self.known_length,
             rig=self.rig, masks=self.masks, object_only=self.object_only, color=self.color,
             full_size=self.full_size,
         )  # fmt: skip
@@ -130,8 +177,10 @@ _INPUTS = {
 _GROUPS = {
     "photographs": ("pattern", "intrinsics", "known_length", "masks", "color", "full_size"),
     "the scan": ("rig", "object_only", "quality"),
-    "this run": ("preview",),
+    "a live scan": ("live", "camera"),
+    "this run": ("preview", "share"),
 }
+LIVE = "live"  # folder of a live scan, in the output
 _STEPS = {"draft": 200, "normal": 1000, "fine": 3000}  # of the training
 _CELLS = {"draft": 256, "normal": 512, "fine": 768}  # along each side of the scene's box
 _REFINED = {"free": "free", "rigid": "rigid-rig", "static-projector": "static-projector"}
@@ -228,6 +277,7 @@ def _state_of(path: Path | None) -> list[tuple[str, int, int]]:
 # The stages. Each calls what its own command calls, and imports it when it is its turn.
 
 _DOING = {  # as the preview says it
+    "live": "scanning",
     "process": "reading, decoding and registering the photographs",
     "train": "preparing the training",
     "export": "exporting mesh and poses",
@@ -246,13 +296,39 @@ class Work:
     @property
     def scan_root(self) -> Path:
         """The scan folder: the given one, or that made of the photographs."""
-        return Path(os.path.abspath(self.config.photographs if self.config.is_scan else self.config.output / "scan"))
+        return Path(os.path.abspath(self.config.captures if self.config.is_scan else self.config.output / "scan"))
 
     def begin(self, stage: str) -> None:
         """Say that a stage is no longer as it was, and is made."""
         say(f"-- {stage} --")
         if self.preview is not None:
             self.preview.say(_DOING[stage])
+
+    def scan_live(self) -> None:
+        """Take the images of a camera until they end, unless that was done before."""
+        config, folder = self.config, self.config.output / LIVE
+        assert config.camera is not None and config.pattern is not None and config.intrinsics is not None
+        key = _key(config.camera, _state_of(config.pattern), _state_of(config.intrinsics))
+        if self.done.is_done("live", key, (f"{LIVE}/captures",)):
+            return say(_kept("live", config.captures))
+        self.begin("live")
+        assert self.preview is not None
+        with phase("start"):
+            from sl_nerfstudio.live.page import Console, LivePage
+            from sl_nerfstudio.live.session import open_session
+            from sl_nerfstudio.live.sources import open_source
+        with self.done.making("live", key):
+            source = open_source(config.camera)
+            work = config.processing().work_folder
+            try:
+                with open_session(folder, source, config.pattern, config.intrinsics, work) as session:
+                    console = Console(say, len(session.rows))
+                    with LivePage(self.preview, session.camera, session.projector) as page:
+                        session.run(source, lambda update: (page.show(update), console.show(update))[0], page.stopped)
+                    session.require_enough()
+            finally:
+                source.close()
+            say(console.summary(session.rows))
 
     def process(self) -> None:
         """Make the scan folder, unless it was made of the same photographs with the same flags."""
@@ -372,7 +448,10 @@ def scan_photographs(config: ScanConfig) -> None:
     begun = time.monotonic()
     with locked(config.output), ExitStack() as stack:
         done = Progress(config.output)
-        work = Work(config, done, stack.enter_context(_opened_preview(config)) if config.preview else None)
+        shown = config.preview or config.live
+        work = Work(config, done, stack.enter_context(_opened_preview(config)) if shown else None)
+        if config.live:
+            work.scan_live()
         if not config.is_scan:
             work.process()
         run_config = work.train()
@@ -384,7 +463,7 @@ def _opened_preview(config: ScanConfig) -> "Preview":
     with phase("start"):
         from sl_nerfstudio.model.preview import Preview
 
-    preview = Preview(config.photographs.name)
+    preview = Preview(config.output.name if config.live else config.captures.name, config.share)
     print(paragraph("preview", preview.where), flush=True)
     return preview
 

@@ -1,6 +1,7 @@
 """The decoder of the coded grid."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.decoder import Decoded, Decoder, drop_small_regions
+from sl_nerfstudio.decoding.decoder import Decoded, Decoder, drop_small_regions, torn
 from sl_nerfstudio.decoding.grid_detection import LEAST_NODES, DetectedGrid, GridDetector, refusal
 from sl_nerfstudio.decoding.grid_edges import Chosen, EdgeChooser, EdgeEvidence, weight_files
 from sl_nerfstudio.decoding.grid_fit import DrawnGrid, draw_sharpnesses, fit_densely
@@ -45,10 +46,27 @@ _TEAR = 0.5  # periods between neighbouring pixels
 _NORMALISING = 0.8  # window of the local intensity normalisation, periods
 _LIGHT_WINDOW = 0.5  # window in which the light is measured, periods
 _LIGHT_BLURS = (0.05, 0.09, 0.14, 0.2)  # of the pattern with which it is measured, periods
+# Which pixels are right without a look at edges.
+_CLEAR_AGREEMENT, _CLEAR_LOG_RATIO = 0.85, 0.9  # of the drawn pattern with the image, and of the symbols
+_BESIDE_TEAR = 0.35  # periods around a tear in which nothing is clear
 # At which size a photograph is decoded.
 _FINEST = 12.0  # pixels a period that are enough: more give no better coordinates
 _LARGE = 1.5e6  # pixels; smaller photographs are decoded as they are
 _LOOKED_AT = 1200  # pixels of the longer side at which the grid is looked for first
+
+
+@dataclass(frozen=True)
+class FirstLook:
+    """An image whose grid was found and read, before edges are looked at."""
+
+    grey: Float32[ndarray, "h w"]
+    found: DetectedGrid
+    evidence: EdgeEvidence
+
+    @property
+    def mask(self) -> Bool[ndarray, "h w"]:
+        """Where the pattern lights the object."""
+        return self.evidence.probability > LEAST_MASK
 
 
 class GridImageDecoder:
@@ -66,12 +84,31 @@ class GridImageDecoder:
         `image` is grey (h, w) or RGB (h, w, 3), 8 or 16 bit. Raises DecodingError if it shows no pattern, or another
         pattern.
         """
+        return self.finished(self.look(image))
+
+    def look(self, image: UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]) -> FirstLook:
+        """The first half of decoding, which `finished` takes up. Raises DecodingError."""
         grey = as_grey(image)
         found = self.detect(grey)
-        evidence = self.examine(grey, found)
-        chosen = self.edges.choose(evidence, found.rectified, found.assignment.turn)
+        return FirstLook(grey, found, self.examine(grey, found))
+
+    def finished(self, first: FirstLook) -> Decoded:
+        """The second half of decoding: coordinates beside edges, and all maps."""
+        found = first.found
+        chosen = self.edges.choose(first.evidence, found.rectified, found.assignment.turn)
         coords = self._select(chosen, found.appearance.period)
-        return self.decoded(grey, coords, evidence.probability > LEAST_MASK, found.appearance.period)
+        return self.decoded(first.grey, coords, first.mask, found.appearance.period)
+
+    def clear_coords(self, first: FirstLook) -> Float32[ndarray, "h w 2"]:
+        """Coordinates that are right without a look at edges: fewer than all, and enough to know where a frame is."""
+        evidence, period = first.evidence, first.found.appearance.period
+        fitted = evidence.fitted
+        reach = 2 * round(_BESIDE_TEAR * period) + 1
+        tear = torn(fitted, _TEAR * self.pattern.period).astype(np.uint8)
+        beside = cv2.dilate(tear, np.ones((reach, reach), np.uint8)) > 0
+        right = (evidence.agreement > _CLEAR_AGREEMENT) & (evidence.log_ratio > _CLEAR_LOG_RATIO)
+        kept = first.mask & right & ~beside & self._inside(fitted)
+        return np.where(kept[..., None], fitted, np.float32(np.nan))
 
     def decoded(
         self,

@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from sl_nerfstudio.model.outputs import TrainedModel
 
 HOST, PORT = "127.0.0.1", 7007  # as nerfstudio's viewer
+EVERYWHERE = "0.0.0.0"  # for all machines of the network
+_ELSEWHERE = "192.0.2.1", 9  # an address that no machine has: which of our own would be used to reach others
 _PORTS = 100  # that are tried
 MOST_POINTS = 100_000  # of all frames together
 _MOST_OF_A_FRAME = 4_000
@@ -64,13 +66,15 @@ class ShownFrame:
 class Preview:
     """A page that shows what has been found; it ends with the block that it is opened for."""
 
-    def __init__(self, title: str) -> None:
-        """Serve the page at the first free port. Raises UserError if there is none."""
+    def __init__(self, title: str, shared: bool = False) -> None:
+        """Serve the page at the first free port; `shared`: to the whole network. Raises UserError if there is none."""
         port = _free_port()
         with redirect_stdout(io.StringIO()):  # viser prints its address, in a frame
-            self._server = viser.ViserServer(HOST, port, verbose=False)
+            self._server = viser.ViserServer(EVERYWHERE if shared else HOST, port, verbose=False)
         found = self._server.get_port()
-        address = f"{HOST}:{found} (open it in a browser; the page ends with this command)"
+        address = (
+            f"{_own_address() if shared else HOST}:{found} (open it in a browser; the page ends with this command)"
+        )
         self.where = address if found == PORT else f"{address}; port {PORT} is in use by another program"
         self._devices: Float64[ndarray, "n 4 4"] | None = None
         self._surface: Float64[ndarray, "v 3"] | None = None
@@ -88,6 +92,11 @@ class Preview:
             box.on_update(lambda _, name=name: self._show(name))
         self._server.on_client_connect(self._look)
 
+    @property
+    def server(self) -> viser.ViserServer:
+        """What serves the page, for those who show more on it."""
+        return self._server
+
     def __enter__(self) -> "Preview":
         return self
 
@@ -96,6 +105,11 @@ class Preview:
         loop = self._server._websock_server._broadcast_buffer.event_loop
         with suppress(RuntimeError):
             loop.call_soon_threadsafe(lambda: None)  # wake it, or it closes the port with the next message only
+
+    def offer_choices(self, offered: bool) -> None:
+        """Whether the page has boxes that choose what is shown; they do nothing while others show things on it."""
+        for box in self._shown.values():
+            box.visible = offered
 
     def say(self, what: str) -> None:
         """Say on the page what the command is doing."""
@@ -196,6 +210,16 @@ def _free_port() -> int:
         f"--preview: no port from {PORT} to {PORT + _PORTS - 1} of this machine can be used\n"
         "    cause:  other programs have them, or this program may not open any\n    remedy: leave the flag out"
     )
+
+
+def _own_address() -> str:
+    """The address at which others in the network reach this machine; nothing is sent to find it."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as tried:
+        try:
+            tried.connect(_ELSEWHERE)
+            return str(tried.getsockname()[0])
+        except OSError:
+            return HOST
 
 
 def _shown(frames: Iterable[tuple[str, Device, Device, ndarray]], poses: DevicePoses) -> Iterator[ShownFrame]:
