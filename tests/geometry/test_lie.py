@@ -17,6 +17,7 @@ from sl_nerfstudio.geometry.lie import (
     DevicePoses,
     Similarity,
     adjoint,
+    angle_deg,
     exp_se3,
     exp_so3,
     fit_similarity,
@@ -296,3 +297,9 @@ def test_frames_without_poses_are_nan_and_stay_so():
     poses.T_world_camera[2] = np.nan
     mapped = poses.mapped(similarity_of(1, 2.0))
     assert np.isnan(mapped.baseline).tolist() == [False, False, True, False, False]
+
+
+@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(lambda v: np.linalg.norm(v) > 0.1), st.floats(0, 180))
+def test_the_angle_of_a_rotation_is_that_of_its_vector_however_small(axis, deg):
+    vector = np.radians(deg) * np.array(axis) / np.linalg.norm(axis)
+    assert angle_deg(Rotation.from_rotvec(vector).as_matrix()) == pytest.approx(deg, abs=1e-9)

@@ -114,10 +114,9 @@ def test_the_usual_step_is_that_which_makes_all_pairs_most_likely(monkeypatch):
     assert graph.usual_step(0, 1, turned(40.0)) == 0.0  # not known yet
     graph.learn_step()
     assert graph.step is not None and graph.step.deg == pytest.approx(16, abs=2.5)
-    sigma = graph.step.sigma_deg
-    assert sigma == pytest.approx(0.3 * graph.step.deg)  # their spread is less
-    for i, j, deg in ((0, 1, 16.0), (1, 0, 3.0), (1, 2, 35.0)):
-        assert graph.usual_step(i, j, turned(deg)) == pytest.approx(-0.5 * ((deg - graph.step.deg) / sigma) ** 2)
+    usual = graph.usual_step(0, 1, turned(-16.0))  # pairs say where the earlier camera is on the later one
+    assert -0.5 < usual <= 0 and graph.usual_step(1, 0, turned(16.0)) == pytest.approx(usual)
+    assert graph.usual_step(0, 1, turned(3.0)) < -LEAST_ODDS  # a tooth away: as small a turn, the other way round
     assert graph.usual_step(0, 2, turned(90.0)) == 0.0  # each step counts once
     assert graph.usual_step(0, 1, turned(170.0)) == -MOST_BY_ORDER  # someone may have walked to the other side
 
@@ -128,7 +127,17 @@ def test_where_surfaces_decide_nothing_small_steps_are_likely(monkeypatch):
     graph = graph_of(monkeypatch, pairs)
     graph.learn_step()
     assert graph.step is not None and graph.step.deg == pytest.approx(18, abs=2)
-    assert graph.usual_step(0, 1, turned(18.0)) > graph.usual_step(0, 1, turned(42.0)) + LEAST_ODDS
+    assert graph.usual_step(0, 1, turned(-18.0)) > graph.usual_step(0, 1, turned(42.0)) + LEAST_ODDS
+
+
+def test_someone_who_walks_to_and_fro_turns_by_as_much_both_ways(monkeypatch):
+    graph = graph_of(monkeypatch, [pair(k, k + 1, 15.0 * (-1) ** (k // 3)) for k in range(FRAMES - 1)])
+    graph.learn_step()
+    assert graph.step is not None and graph.step.rms_deg == pytest.approx(15, abs=5)
+    for way in (-1, 1):
+        assert (
+            graph.usual_step(0, 1, turned(15.0 * way)) > -2.5 > -LEAST_ODDS > graph.usual_step(0, 1, turned(90.0 * way))
+        )
 
 
 def test_frames_that_follow_each_other_in_no_order_have_no_usual_step(monkeypatch):
