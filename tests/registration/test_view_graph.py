@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.registration import view_graph as module
+from sl_nerfstudio.registration.assembly import Assembly
+from sl_nerfstudio.registration.blocks import OpenBlock, Settled
 from sl_nerfstudio.registration.evidence import Commonness, Frame
 from sl_nerfstudio.registration.pairs import LEAST_ODDS, NEIGHBOURS, PairMatch, Rival
-from sl_nerfstudio.registration.pose_graph import Pivots
+from sl_nerfstudio.registration.pose_graph import Component, Pivots
 from sl_nerfstudio.registration.view_graph import (
     MOST_BY_ORDER,
     ViewGraph,
@@ -153,6 +155,32 @@ def test_where_most_successive_frames_slip_the_order_says_nothing(monkeypatch):
     graph = graph_of(monkeypatch, pairs)
     graph.learn_step()
     assert graph.step is None and graph.usual_step(0, 1, turned(170.0)) == 0.0
+
+
+# Blocks whose place is not decided.
+
+
+def test_what_is_taken_apart_is_looked_at_again_inside(monkeypatch):
+    """Of six frames two are decided; of the four others, which are open, only three hold together."""
+    graph = graph_of(monkeypatch, [pair(k, k + 1) for k in range(FRAMES - 1)])
+    reviewed: list[list[int]] = []
+
+    class Review:
+        def __init__(self, assembly: Assembly, component: Component) -> None:
+            self.nodes = component
+
+        def settled(self) -> Settled:
+            reviewed.append(sorted(self.nodes))
+            kept = reviewed[-1][: 2 if len(self.nodes) == FRAMES else 3]
+            rest = {k: S for k, S in self.nodes.items() if k not in kept}
+            open_ = (OpenBlock(rest, 90.0, float(len(rest))),) if rest else ()
+            return Settled({k: self.nodes[k] for k in kept}, open_, False, (90.0,))
+
+    monkeypatch.setattr(module, "BlockReview", Review)
+    monkeypatch.setattr(Assembly, "grow", lambda self: [{k: Similarity.identity() for k in range(FRAMES)}])
+    assert [sorted(c) for c in graph.assemble()] == [[2, 3, 4], [0, 1], [5]]
+    assert [(sorted(block.nodes), block.log_odds) for block in graph.open] == [([2, 3, 4], 4.0), ([5], 1.0)]
+    assert reviewed == [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5]]
 
 
 # Rough camera poses as a start: baselines, and a common centre.
