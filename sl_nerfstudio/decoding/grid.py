@@ -215,6 +215,10 @@ class NetworkDecoder(Decoder[GridPattern]):
         """See `Decoder`; what a GPU gives may differ in the last digits."""
         return super().key if self.networks is None else f"{super().key} on a GPU"
 
+    def __getstate__(self) -> dict[str, object]:
+        """What another process gets: it loads its own networks."""
+        return {name: value for name, value in vars(self).items() if name != "images"}
+
     def decode(self, images: Sequence[Pixels], names: Sequence[str]) -> Decoded:
         """Decode the one image of a frame."""
         return self.images.decode(images[0])

@@ -44,8 +44,14 @@ class Settled:
 
     decided: Component
     open: tuple[OpenBlock, ...]  # in the same world
-    by_order: bool  # surfaces alone would have left more open
-    turns_deg: tuple[float, ...]  # by which blocks may be turned, as far as surfaces tell
+
+
+@dataclass(frozen=True)
+class Sides:
+    """What surfaces alone say of the sides of an object."""
+
+    by_order: bool = False  # they would have left more frames open than the order of capture did
+    turns_deg: tuple[float, ...] = ()  # by which blocks may be turned, as far as they tell
 
 
 @dataclass(frozen=True)
@@ -75,6 +81,8 @@ class BlockReview:
         self._assembly, self._pivots, self._prior = assembly, assembly.pivots, assembly.prior
         self._edges = [e for e in assembly.edges if e.source in component and e.target in component]
         self._elsewhere: dict[int, tuple[Component, list[Elsewhere]]] = {}  # places of frames, and among which others
+        self._turns_tried: list[Turn] = []
+        self._left_open: list[OpenBlock] = []
         self._degree = Counter(k for e in self._edges for k in (e.source, e.target))
         self.nodes = optimise_at_places(self._edges, self._pivots, component).S_world_camera
 
@@ -95,13 +103,16 @@ class BlockReview:
             self.nodes = there
             self._elsewhere.clear()
             turns = self._turns()
-        open_ = self._open(turns, with_order=True)
-        without = open_ if self._prior is None else self._open(turns, with_order=False)
-        out = {k for block in open_ for k in block.nodes}
-        return Settled(
-            {k: S for k, S in self.nodes.items() if k not in out},
-            tuple(open_),
-            sum(len(block.nodes) for block in without) > len(out),
+        self._turns_tried, self._left_open = turns, self._open(turns, with_order=True)
+        out = {k for block in self._left_open for k in block.nodes}
+        return Settled({k: S for k, S in self.nodes.items() if k not in out}, tuple(self._left_open))
+
+    def sides(self) -> Sides:
+        """What surfaces alone say of blocks, after `settled`."""
+        open_ = self._left_open
+        without = open_ if self._prior is None else self._open(self._turns_tried, with_order=False)
+        return Sides(
+            sum(len(block.nodes) for block in without) > sum(len(block.nodes) for block in open_),
             _distinct(sorted(block.turn_deg for block in without if block.turn_deg >= LEAST_SIDE_DEG)),
         )
 

@@ -119,6 +119,7 @@ def _in_order(components: Sequence[Component], n: int) -> bool:
 def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Registration:
     """Poses and baselines of the largest component; every other frame with its reason."""
     components = graph.assemble()
+    sides = graph.sides_of_object()
     edges = graph.holding(components[0])
     main = components[0] if len(components[0]) > 1 else {}
     component = _numbers(components, len(names))
@@ -154,9 +155,9 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
         ),
         tuple(UncertainRotation(names[k], sigma[k]) for k in index if sigma[k] > LARGEST_SIGMA_ROTATION_DEG),
         tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
-        graph.turns_deg,
+        sides.turns_deg,
         ordered,
-        graph.by_order,
+        sides.by_order,
     )  # fmt: skip
 
 

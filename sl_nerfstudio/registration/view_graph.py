@@ -16,7 +16,7 @@ from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.parallel import tracked
 from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, COARSE_POINTS, Side, Tolerance, agreement_at
 from sl_nerfstudio.registration.assembly import Assembly, see_same_side
-from sl_nerfstudio.registration.blocks import BlockReview, OpenBlock
+from sl_nerfstudio.registration.blocks import BlockReview, OpenBlock, Sides
 from sl_nerfstudio.registration.evidence import Commonness, Frame, ScanEvidence
 from sl_nerfstudio.registration.pairs import (
     ANYWHERE,
@@ -179,8 +179,7 @@ class ViewGraph:
         self._tried: dict[Pair, PairMatch | None] = {}
         self._searched: set[tuple[Pair, Search]] = set()
         self.open: list[OpenBlock] = []  # what the last assembly left undecided
-        self.turns_deg: tuple[float, ...] = ()  # after which surfaces look the same
-        self.by_order = False  # the order of capture has decided places that surfaces did not
+        self._reviews: list[BlockReview] = []  # of the last assembly
 
     @property
     def matches(self) -> list[PairMatch]:
@@ -248,12 +247,12 @@ class ViewGraph:
         frames are put together all the same.
         """
         edges, scan = self.edges, self.evidence()
-        self.by_order, self.open, self.turns_deg = False, [], ()
+        self._reviews, self.open = [], []
         assembly = self.assembly([e for e in edges if e.holds], scan)
         components = assembly.grow()
         if len(components[0]) == 1:
             return self.assembly(edges, scan).grow()
-        found, turns = list[Component](), set[float]()
+        found: list[Component] = []
         left: list[tuple[Component, OpenBlock | None]] = [(component, None) for component in components]
         while left:
             component, block = left.pop(0)
@@ -261,14 +260,19 @@ class ViewGraph:
                 found.append(component)
                 self.open += [] if block is None else [block]
                 continue
-            one = BlockReview(assembly, component).settled()
+            self._reviews.append(BlockReview(assembly, component))
+            one = self._reviews[-1].settled()
             found.append(one.decided)
             self.open += [] if block is None else [replace(block, nodes=one.decided)]
             left += [(inner.nodes, inner) for inner in one.open]  # what holds together inside is not known yet
-            turns |= set(one.turns_deg)
-            self.by_order |= one.by_order
-        self.turns_deg = tuple(sorted(turns))
         return sorted(found, key=lambda c: (-len(c), min(c)))
+
+    def sides_of_object(self) -> Sides:
+        """What surfaces alone say of the sides of the object, in the last assembly."""
+        found = [review.sides() for review in self._reviews]
+        return Sides(
+            any(one.by_order for one in found), tuple(sorted({turn for one in found for turn in one.turns_deg}))
+        )
 
     def assembly(self, edges: Sequence[PairMatch], scan: ScanEvidence) -> Assembly:
         """Frames that pairs may join."""

@@ -403,7 +403,7 @@ def symmetry_sentence(turns_deg: Sequence[float]) -> str:
 
 def _placed_by_order(turns_deg: Sequence[float]) -> Reason:
     """Say what it means that the order of capture decided which side each frame shows."""
-    how = "each was placed by the order of capture, turned as little as possible against the one before"
+    how = "each was placed by the order of capture, turned on from the one before as most are"
     if not turns_deg:
         return Reason(
             "acceptable",

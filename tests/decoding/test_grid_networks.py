@@ -1,6 +1,7 @@
 """The networks in a process of their own, as on a GPU, and what is said where one fails."""
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -29,6 +30,13 @@ def _begin(networks):
 
 def _read(_):
     return globals()["_networks"].unet(CHANNELS_OF_AN_IMAGE)
+
+
+def test_a_decoder_that_has_read_an_image_here_can_be_given_to_another_process():
+    decoder = NetworkDecoder(GridPattern())
+    assert decoder.images is decoder.images
+    found = pickle.loads(pickle.dumps(decoder))
+    assert found.key == decoder.key and "images" not in vars(found)
 
 
 def test_one_process_computes_for_all_others_what_each_would():

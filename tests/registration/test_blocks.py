@@ -84,12 +84,13 @@ def test_what_no_pair_decides_is_taken_out_with_its_turn_and_its_odds():
     """Frames 3, 4 and 5 show a side that is the same a quarter farther on."""
     edges = [e for e in pairs(-40.0) if len({e.source, e.target} & {3, 4, 5}) != 1]
     open_ = [e for e in pairs(-1.0) if len({e.source, e.target} & {3, 4, 5}) == 1]
-    found = review([*edges, *open_], dict(enumerate(NODES)))
+    one = BlockReview(Said([*edges, *open_], None), dict(enumerate(NODES)))
+    found = one.settled()
     assert sorted(found.decided) == [k for k in range(FRAMES) if k not in (3, 4, 5)]
     (block,) = found.open
     assert sorted(block.nodes) == [3, 4, 5] and block.turn_deg == pytest.approx(TURN, abs=0.1)
     assert 0 <= block.log_odds < 10
-    assert off_deg({**found.decided, **block.nodes}) < 0.1 and not found.by_order
+    assert off_deg({**found.decided, **block.nodes}) < 0.1 and not one.sides().by_order
 
 
 class Seen(Said):
@@ -133,8 +134,9 @@ def test_the_order_of_capture_keeps_what_surfaces_leave_open_and_that_is_said():
     def prior(i: int, j: int, S: Similarity) -> float:
         return -25.0 * float(abs(i - j) == 1 and abs(angle_deg(S.R) - 30) > 10)
 
-    found = review(pairs(0.0), dict(enumerate(NODES)), prior)
-    assert sorted(found.decided) == list(range(FRAMES)) and found.by_order
+    one = BlockReview(Said(pairs(0.0), prior), dict(enumerate(NODES)))
+    found = one.settled()
+    assert sorted(found.decided) == list(range(FRAMES)) and one.sides().by_order
     assert len(review(pairs(0.0), dict(enumerate(NODES))).decided) < FRAMES
 
 

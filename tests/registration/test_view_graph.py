@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.registration import view_graph as module
 from sl_nerfstudio.registration.assembly import Assembly
-from sl_nerfstudio.registration.blocks import OpenBlock, Settled
+from sl_nerfstudio.registration.blocks import OpenBlock, Settled, Sides
 from sl_nerfstudio.registration.evidence import Commonness, Frame
 from sl_nerfstudio.registration.pairs import LEAST_ODDS, NEIGHBOURS, PairMatch, Rival
 from sl_nerfstudio.registration.pose_graph import Component, Pivots
@@ -174,13 +174,16 @@ def test_what_is_taken_apart_is_looked_at_again_inside(monkeypatch):
             kept = reviewed[-1][: 2 if len(self.nodes) == FRAMES else 3]
             rest = {k: S for k, S in self.nodes.items() if k not in kept}
             open_ = (OpenBlock(rest, 90.0, float(len(rest))),) if rest else ()
-            return Settled({k: self.nodes[k] for k in kept}, open_, False, (90.0,))
+            return Settled({k: self.nodes[k] for k in kept}, open_)
+
+        def sides(self) -> Sides:
+            return Sides(len(self.nodes) < FRAMES, (90.0,))
 
     monkeypatch.setattr(module, "BlockReview", Review)
     monkeypatch.setattr(Assembly, "grow", lambda self: [{k: Similarity.identity() for k in range(FRAMES)}])
     assert [sorted(c) for c in graph.assemble()] == [[2, 3, 4], [0, 1], [5]]
     assert [(sorted(block.nodes), block.log_odds) for block in graph.open] == [([2, 3, 4], 4.0), ([5], 1.0)]
-    assert reviewed == [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5]]
+    assert reviewed == [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5]] and graph.sides_of_object() == Sides(True, (90.0,))
 
 
 # Rough camera poses as a start: baselines, and a common centre.
