@@ -55,6 +55,8 @@ SPREAD_COUNT = 4.0  # turns that this spread counts as
 LARGEST_STEP_DEG = 40.0  # of someone who walks around an object
 NO_ORDER_DEG = 25.0  # spread of the turns of frames in no order that see a common surface
 SMALL_STEP_DEG = 10.0  # of steps that surfaces allow alike smaller ones are likelier: scale of their distribution
+ORDER_ODDS = 1.0  # nats by which frames in no order must be likelier: photographs are numbered as they are taken
+LEAST_LIKELIHOOD = 1e-300  # so that what nothing explains has a logarithm
 STEP_STARTS, STEP_ROUNDS = 80, 12  # of the search for the usual step
 LARGEST_GAP = 2  # between frames by which the usual step is learnt
 MOST_BY_ORDER = 25.0  # nats against a place by the order: someone may have walked to the other side
@@ -290,17 +292,18 @@ class ViewGraph:
         return ScanEvidence(frames, common, np.array([np.median(each) if each else 1.0 for each in noise]))
 
     def learn_step(self) -> None:
-        """How the camera usually turns between successive frames, if it does: what makes their pairs' places likeliest.
+        """How the camera usually turns between successive frames: what makes the places of their pairs likeliest.
 
-        None if frames in no order turn as much, or by as much.
+        None if turns do not grow with the number of frames that lie between, as those in no order do not.
         """
         self.step = None
         pairs = [e for e in self.edges if abs(e.target - e.source) <= LARGEST_GAP and e.holds]
         if sum(abs(e.target - e.source) == 1 for e in pairs) <= LEAST_STEPS * (len(self.frames) - 1):
             return
         turns = Turns.of(pairs)
-        step = likeliest_step(turns)
-        if step.rms_deg <= LARGEST_STEP_DEG and turns.probability(step).mean() >= LEAST_STEPS:
+        (step, odds), (_, without) = likeliest_step(turns), likeliest_step(turns.in_no_order())
+        usual = step.rms_deg <= LARGEST_STEP_DEG and turns.probability(step).mean() >= LEAST_STEPS
+        if usual and without <= odds + ORDER_ODDS:
             self.step = step
 
     def usual_step(self, i: int, j: int, S_i_j: Similarity) -> float:
@@ -379,6 +382,7 @@ class Turns:
     """By how much cameras of pairs turn from one frame to the next, at all places that the pairs allow."""
 
     turn_deg: Float64[ndarray, "n 3"]
+    steps: Float64[ndarray, "n"]  # from one frame of the pair to the other
     weight: Float64[ndarray, "n"]  # share of the place among those of its pair
     pair: Int64[ndarray, "n"]
 
@@ -393,42 +397,57 @@ class Turns:
             for one in e.places:
                 S = one.S_target_source.inverse() if e.target > e.source else one.S_target_source
                 turn.append(turn_deg(S) / abs(e.target - e.source))
-        return Turns(np.stack(turn), np.concatenate(weight), np.array(number, dtype=np.int64))
+        each = np.array(number, dtype=np.int64)
+        steps = np.array([abs(e.target - e.source) for e in pairs], dtype=np.float64)
+        return Turns(np.stack(turn), steps[each], np.concatenate(weight), each)
 
-    def log_likelihood(self, step: UsualStep) -> Float64[ndarray, "pairs"]:
-        """Of the turn of each pair."""
-        return np.log(np.bincount(self.pair, self.weight * np.exp(step.log_density(self.turn_deg))) + 1e-300)
+    def in_no_order(self) -> "Turns":
+        """The same as if the frames of each pair followed each other."""
+        return replace(self, turn_deg=self.turn_deg * self.steps[:, None], steps=np.ones_like(self.steps))
 
-    def probability(self, step: UsualStep) -> Float64[ndarray, "pairs"]:
-        """That each pair turned by the usual step, and not as frames in no order do."""
-        return 1 / (1 + np.exp(np.clip(self.log_likelihood(NO_ORDER) - self.log_likelihood(step), -50, 50)))
+    def likelihood(self, step: UsualStep) -> Float64[ndarray, "n"]:
+        """Of the turn between both frames, at each place."""
+        return self.weight * np.exp(step.log_density(self.turn_deg)) / self.steps**3
+
+    @property
+    def unusual(self) -> Float64[ndarray, "n"]:
+        """The same of frames in no order."""
+        return self.weight * np.exp(NO_ORDER.log_density(self.turn_deg * self.steps[:, None]))
 
     def places(self, step: UsualStep) -> Float64[ndarray, "n"]:
         """Probability that each place is the right one and its pair turned by the usual step."""
-        each, none = (self.weight * np.exp(one.log_density(self.turn_deg)) for one in (step, NO_ORDER))
-        total = np.bincount(self.pair, each + none)
-        return each / total[self.pair]
+        each = self.likelihood(step)
+        return each / np.bincount(self.pair, each + self.unusual + LEAST_LIKELIHOOD)[self.pair]
+
+    def probability(self, step: UsualStep) -> Float64[ndarray, "pairs"]:
+        """That each pair turned by the usual step, and not as frames in no order do."""
+        return np.bincount(self.pair, self.places(step))
+
+    def log_likelihood(self, step: UsualStep) -> float:
+        """Of all pairs."""
+        return float(np.log(np.bincount(self.pair, self.likelihood(step) + self.unusual) + LEAST_LIKELIHOOD).sum())
 
 
-def likeliest_step(turns: Turns) -> UsualStep:
-    """The normal distribution of turns that makes those of all pairs likeliest (EM: Dempster et al., 1977)."""
+def likeliest_step(turns: Turns) -> tuple[UsualStep, float]:
+    """The normal distribution of turns that makes those of all pairs likeliest, and their log-likelihood.
+
+    Expectation maximisation (Dempster et al., 1977) from many starts.
+    """
     likely = np.flatnonzero(np.linalg.norm(turns.turn_deg, axis=1) <= LARGEST_STEP_DEG)
     likely = likely[np.argsort(-turns.weight[likely], kind="stable")[:STEP_STARTS]]
+    starts = [NO_ORDER, *(UsualStep(mean, spread_deg(mean) ** 2 * np.eye(3)) for mean in turns.turn_deg[likely])]
     best, most = NO_ORDER, -np.inf
-    for mean in (np.zeros(3), *turns.turn_deg[likely]):
-        step = UsualStep(mean, (NO_ORDER_DEG**2 if not mean.any() else spread_deg(mean) ** 2) * np.eye(3))
+    for step in starts:
         for _ in range(STEP_ROUNDS):
             w = turns.places(step)
-            total = w.sum() + 1e-9
-            mean = w @ turns.turn_deg / total
+            mean = w @ turns.turn_deg / (w.sum() + LEAST_LIKELIHOOD)
             d = turns.turn_deg - mean
             spread = spread_deg(mean) ** 2 * np.eye(3)
-            step = UsualStep(mean, ((w[:, None] * d).T @ d + SPREAD_COUNT * spread) / (total + SPREAD_COUNT))
-        both = np.logaddexp(turns.log_likelihood(step), turns.log_likelihood(NO_ORDER))
-        found = float(both.sum()) - step.deg / SMALL_STEP_DEG
+            step = UsualStep(mean, ((w[:, None] * d).T @ d + SPREAD_COUNT * spread) / (w.sum() + SPREAD_COUNT))
+        found = turns.log_likelihood(step) - step.deg / SMALL_STEP_DEG
         if found > most:
             best, most = step, found
-    return best
+    return best, most
 
 
 def spread_deg(mean_deg: Float64[ndarray, "3"]) -> float:

@@ -149,6 +149,19 @@ def test_frames_that_follow_each_other_in_no_order_have_no_usual_step(monkeypatc
     assert graph.step is None and graph.usual_step(0, 1, turned(170.0)) == 0.0
 
 
+def test_turns_that_do_not_grow_with_the_number_of_frames_between_are_of_no_order(monkeypatch):
+    """Small ones, as all pairs of an object allow that looks the same after every 40 degrees."""
+    turns = np.random.default_rng(1).uniform(-20, 20, (2, FRAMES))
+    pairs = [pair(k, k + gap, float(turns[gap - 1, k])) for gap in (1, 2) for k in range(FRAMES - gap)]
+    graph = graph_of(monkeypatch, pairs)
+    graph.learn_step()
+    assert graph.step is None
+    walk = [pair(k, k + gap, 15.0 * gap + turns[gap - 1, k] / 10) for gap in (1, 2) for k in range(FRAMES - gap)]
+    graph = graph_of(monkeypatch, walk)
+    graph.learn_step()
+    assert graph.step is not None and graph.step.deg == pytest.approx(15, abs=1)
+
+
 def test_where_most_successive_frames_slip_the_order_says_nothing(monkeypatch):
     """A vase."""
     pairs = [pair(k, k + 1, slip=12.0 * (k > 1)) for k in range(FRAMES - 1)]
