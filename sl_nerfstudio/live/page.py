@@ -161,11 +161,9 @@ class LivePage:
         if now is None or update.sight.cloud is None:
             return
         relative = update.sight.cloud.pose.T_camera_projector
-        T_camera = np.eye(4)
-        T_camera[:3, :3], T_camera[:3, 3] = now.R, now.t
         colours = _STATE_COLOURS[update.placed.state], COLOURS["projector"]
         for name, device, T, colour in zip(
-            ("camera", "projector"), self._devices, (T_camera, now.poses(relative)), colours, strict=True
+            ("camera", "projector"), self._devices, (now.poses(np.eye(4)), now.poses(relative)), colours, strict=True
         ):
             node = self._server.scene.add_camera_frustum(
                 f"/live/now/{name}", vertical_fov(device), device.w / device.h, _NOW_SIZE * self._size, color=colour

@@ -133,9 +133,7 @@ class Session:
         out = np.full((len(self.rows), 4, 4), np.nan)
         for k, row in enumerate(self.rows):
             if row.S_anchor_camera is not None and row.anchor in self.tracker.model.nodes:
-                S = self.tracker.model.nodes[row.anchor] @ row.S_anchor_camera
-                out[k] = np.eye(4)
-                out[k, :3, :3], out[k, :3, 3] = S.R, S.t
+                out[k] = (self.tracker.model.nodes[row.anchor] @ row.S_anchor_camera).poses(np.eye(4))
         return out
 
     def run(self, source: Source, watch: Watch, stopped: Callable[[], bool] = lambda: False) -> None:

@@ -129,7 +129,7 @@ class Model:
         """Both devices of the kept frames, lengths in the unit of the model."""
         cameras, projectors = np.tile(np.eye(4), (2, len(self), 1, 1))
         for k, S in self.nodes.items():
-            cameras[k, :3, :3], cameras[k, :3, 3] = S.R, S.t
+            cameras[k] = S.poses(np.eye(4))
             projectors[k] = S.poses(self.kept[k].T_camera_projector)
         return DevicePoses(cameras, projectors)
 
