@@ -56,8 +56,8 @@ def training(method: str, backend: str, scan_root: Path, folder: Path) -> Traini
     config = settings(method, scan_root, folder / backend, "cpu", 40)
     c = config.pipeline.model
     c.sdf.backend, c.sdf.log2_table_size, c.sdf.max_resolution, c.sdf.hidden = backend, 12, 64, 32
-    c.sampling.render_rays, c.sampling.eikonal_points = 200, 300
-    config.pipeline.datamanager.train_num_rays_per_batch = 256
+    c.sampling.render_rays, c.sampling.eikonal_points = 100, 150
+    config.pipeline.datamanager.train_num_rays_per_batch = 128
     torch.manual_seed(0)
     return Training(config)
 
