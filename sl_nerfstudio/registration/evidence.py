@@ -79,7 +79,6 @@ NEAR_SIGMAS = 3.0  # and what errors of both relative poses explain
 
 CONTRADICTING_SIGMAS = 3.0  # behind the surface, from which it is asked whether an edge hides a point
 STEEPEST = 5.0  # change of distance from place to place, in their width, beyond which a surface has an edge
-MOST_PLACES_HIDDEN = 32  # of the lattice from a point to the edge that hides it
 
 JUDGED, ABSENT, UNDECODED, HIDDEN = 1, 2, 3, 4  # codes of points that are in view
 
@@ -348,7 +347,7 @@ def _behind_edge(X, Y, Z, rho, eye, surface, code, camera, jump):
     """Whether a point that lies behind the surface is hidden by an edge of it, and seen past that edge from `eye`.
 
     On the way towards the other camera the point comes out from behind the surface: through it, or where its distance
-    jumps. `jump`: of the distances around the point.
+    jumps; however far away that is, as behind a post. `jump`: of the distances around the point.
     """
     h, w = surface.shape[0], surface.shape[1]
     d = np.sqrt(X * X + Y * Y + Z * Z)
@@ -365,7 +364,7 @@ def _behind_edge(X, Y, Z, rho, eye, surface, code, camera, jump):
     if jump > steepest:
         return True
     last = float(surface[int(row), int(column), 0])
-    for n in range(1, MOST_PLACES_HIDDEN + 1):
+    for n in range(1, int(far / step) + 1):
         x, y, z = X + n * step * a, Y + n * step * b, Z + n * step * c
         column, row, front = pixel_of(code, x, y, z, camera)
         if not (front and column >= 0 and row >= 0 and column < w and row < h):
