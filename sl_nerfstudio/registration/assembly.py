@@ -148,12 +148,12 @@ class Assembly:
         nodes = [self.settled(first, second, S) for S in places]
         found = self.compare(first, second, nodes)
         usual = np.array([self.usual(first, second, at) for at in nodes])
-        best, both = self._likeliest(first, second, places, found, usual[:, None] - usual)
+        settled = [self._between_worlds(first, second, at) for at in nodes]
+        best, both = self._likeliest(first, second, settled, found, usual[:, None] - usual)
         if found.odds[best] < LEAST_ODDS:
             return None
-        others = [k for k, at in enumerate(nodes) if k != best and self.differ(first, second, nodes[best], at)]
-        S = self._between_worlds(first, second, nodes[best])
-        return Decision(S, float(min(both[others], default=found.odds[best])))
+        others = [k for k, S in enumerate(settled) if k != best and self._differ(settled[best], S, second)]
+        return Decision(settled[best], float(min(both[others], default=found.odds[best])))
 
     def _likeliest(
         self, first: Component, second: Component, places: Sequence[Similarity], found: Comparison,
@@ -192,13 +192,14 @@ class Assembly:
         if_not, if_so = (replace(found, alike=np.full_like(found.alike, so)).leads[:, 0] for so in (False, True))
         either = np.maximum(found.leads[:, 0], if_so)
         out: list[Elsewhere] = []
-        for k, S in enumerate(places):
+        for k in range(1, len(places)):
             order = usual[k] - usual[0]
             unlikely = found.odds[k] < LEAST_ODDS or either[k] + max(order, 0) <= -LEAST_ODDS
-            if k == 0 or unlikely or not self.differ(rest, second, nodes[0], nodes[k]):
+            if unlikely or not self.differ(rest, second, nodes[0], nodes[k]):
                 continue
-            alike = if_not[k] != if_so[k] and self.looks_alike(rest, S)
-            out.append(Elsewhere(S, float(if_so[k] if alike else if_not[k]), order))
+            turn = nodes[k][frame] @ nodes[0][frame].inverse()
+            alike = if_not[k] != if_so[k] and self.looks_alike(rest, turn)
+            out.append(Elsewhere(turn, float(if_so[k] if alike else if_not[k]), order))
         return out
 
     def _proposed(self, first: Component, second: Component) -> list[Similarity]:
