@@ -1,6 +1,5 @@
 """Finishing a mesh: its observed part marked, holes filled, a closed solid, fewer triangles."""
 
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -84,7 +83,6 @@ class ClosestSurface:
 # A field whose zero level is closed: it ends at the walls of its box, and at planes.
 
 _MARGIN = 2e-3  # of the box's half side: what is nearer to its walls is outside
-
 _FACETS = 64  # of a convex hull, the largest ones: the many small ones are where the surface was observed
 
 Planes = list[tuple[Float64[ndarray, "3"], float]]
@@ -98,10 +96,8 @@ class ClosedField:
     signed distances, so walls and planes cut the solid with flat faces.
     """
 
-    def __init__(
-        self, field: Field, planes: Sequence[tuple[Float64[ndarray, "3"], float]], device: torch.device
-    ) -> None:
-        """`planes` are unit normals n and offsets d in the box's frame: points with n . p > d are above."""
+    def __init__(self, field: Field, planes: Planes, device: torch.device) -> None:
+        """`planes` are in the box's frame."""
         self._field = field
         self._normals = [(torch.as_tensor(n, dtype=torch.float32, device=device), d) for n, d in planes]
 
@@ -116,7 +112,7 @@ class ClosedField:
 def hull_planes(points: Float[ndarray, "n 3"], margin: float) -> Planes:
     """The largest faces of the convex hull of points, moved out by `margin`, with the points above them.
 
-    None if the points have no volume.
+    Without any if the points have no volume.
     """
     try:
         hull = ConvexHull(points)

@@ -155,8 +155,7 @@ def _look(
 def _look_up(frame: Frame, uv: Float64[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
     """Bilinear values of the frame's picture in [0, 1]; grey pictures in all three channels."""
     image = frame.read_color()
-    if image is None:
-        raise ValueError(f"frame {frame.name} was not captured without the pattern")
+    assert image is not None  # frames without a picture are not asked
     values = image.reshape(*image.shape[:2], -1) / np.iinfo(image.dtype).max
     place = (uv - 0.5).T[::-1]  # the centre of the first pixel is (0.5, 0.5)
     channels = [map_coordinates(values[..., c], place, order=1, mode="nearest") for c in range(values.shape[2])]
@@ -308,7 +307,9 @@ def surface_texture(mesh: Mesh, size: int, whole: Mesh, pictures: Pictures) -> T
         image[some] = colours.rgb
         seen += int(colours.seen.sum())
     filled = _filled(image.reshape(size, size, 3), triangle >= 0)
-    texel = (float(mesh.face_areas().sum()) / max(_area(uv), 1e-300)) ** 0.5 / size
+    (ax, ay), (bx, by) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
+    flat = float(np.abs(ax * by - ay * bx).sum()) / 2  # area of the charts
+    texel = (float(mesh.face_areas().sum()) / max(flat, 1e-300)) ** 0.5 / size
     return Textured(Texture(charts, filled), texel, seen / max(len(texels), 1), seconds)
 
 
@@ -350,9 +351,3 @@ def _filled(image: UInt8[ndarray, "n n 3"], known: Bool[ndarray, "n n"]) -> UInt
     of_label = np.zeros((int(label.max()) + 1, 3), np.uint8)
     of_label[label[known]] = image[known]
     return of_label[label]
-
-
-def _area(corners: Float64[ndarray, "f 3 2"]) -> float:
-    """Total area of triangles in the plane."""
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return float(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()) / 2

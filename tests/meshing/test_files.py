@@ -147,9 +147,9 @@ def test_normals_and_cutting():
     normals = MESH.vertex_normals()
     outward = (MESH.vertices - [100.0, -20.0, 3.0]) / 40
     assert ((normals * outward).sum(1) > 0.99).all()
-    upper = MESH.with_vertices(MESH.vertices[:, 2] > 3.0)
-    assert (upper.vertices[:, 2] > 3.0).all() and set(np.unique(upper.faces)) == set(range(len(upper.vertices)))
     expected = (MESH.vertices[MESH.faces][..., 2] > 3.0).all(1)
+    upper = MESH.with_faces(expected)
+    assert (upper.vertices[:, 2] > 3.0).all() and set(np.unique(upper.faces)) == set(range(len(upper.vertices)))
     assert upper.face_areas().sum() == pytest.approx(MESH.face_areas()[expected].sum())
 
 
