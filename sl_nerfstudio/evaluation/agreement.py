@@ -159,28 +159,21 @@ _JUMP = 2.5  # usual steps between neighbouring pixels, beyond which coordinates
 _LARGE_PATCH = 0.03  # of the decoded pixels: larger patches are no wrong decodings but surface that is missing
 
 
-@dataclass(frozen=True)
-class Holes:
-    """Missing surface in one frame, as shares of its decoded pixels."""
-
-    missing: float  # all of it
-    largest: float  # the largest connected area; gaps along rims do not count
-
-
-def find_holes(pixels: FramePixels, mesh_size: float) -> Holes:
+def find_holes(pixels: FramePixels, mesh_size: float) -> tuple[float, float]:
     """Decoded pixels whose ray misses the mesh, or passes far behind the triangulated point before it hits.
 
-    `mesh_size` is the diagonal of the mesh's box, in its unit. Patches of coordinates that are not continuous with what
-    surrounds them are wrong decodings, unless they are large.
+    As shares of all decoded ones: first all of them, then the largest connected area; gaps along rims do not count for
+    that. `mesh_size` is the diagonal of the mesh's box, in its unit. Patches of coordinates that are not continuous
+    with what surrounds them are wrong decodings, unless they are large.
     """
     trusted = pixels.decoded & (np.abs(pixels.epipolar) < _SIGMAS * pixels.noise_px)
     count = int(trusted.sum())
     if count == 0:
-        return Holes(0.0, 0.0)
+        return 0.0, 0.0
     through = (pixels.behind > _LEAST_DEPTH * mesh_size) & (pixels.coordinate > pixels.tolerance_px)
     missing = _as_image(pixels, trusted & (~pixels.hit | through), False)
     missing &= ~_wrong_patches(pixels, missing, count)
-    return Holes(float(missing.sum() / count), _largest_area(missing, count) / count)
+    return float(missing.sum() / count), _largest_area(missing, count) / count
 
 
 def _as_image(pixels: FramePixels, values: ndarray, nothing: float | bool) -> ndarray:
@@ -257,12 +250,12 @@ class CaptureAgreement:
     frames: tuple[FrameAgreement, ...]
 
 
-def frame_agreement(name: str, masked: int, pixels: FramePixels, holes: Holes) -> FrameAgreement:
-    """Summary of one frame's pixels, and of what is missing there."""
-    both = pixels.lit & np.isfinite(pixels.rendered)
+def frame_agreement(name: str, pixels: FramePixels, mesh_size: float) -> FrameAgreement:
+    """Summary of one frame's pixels, and of what is missing there; `mesh_size` as for `find_holes`."""
+    both, holes = pixels.lit & np.isfinite(pixels.rendered), find_holes(pixels, mesh_size)
     return FrameAgreement(
         name=name,
-        pixels=masked,
+        pixels=len(pixels.row) * pixels.stride**2,
         hit_share=_mean(pixels.hit),
         lit_share=_mean(pixels.lit),
         decoded_share=_mean(pixels.decoded),
@@ -274,8 +267,8 @@ def frame_agreement(name: str, masked: int, pixels: FramePixels, holes: Holes) -
         ray_angle_deg=_median(pixels.ray_angle_deg),
         covered_share=_mean(pixels.hit[pixels.decoded]),
         agreeing_share=_mean(pixels.coordinate[pixels.decoded & pixels.hit] < pixels.tolerance_px),
-        hole_share=holes.missing,
-        largest_hole=holes.largest,
+        hole_share=holes[0],
+        largest_hole=holes[1],
     )
 
 
@@ -293,8 +286,7 @@ def compare_captures(
 
     def compare(frame: Frame, *poses: Float[ndarray, "4 4"]) -> tuple[Frame, FrameAgreement, FramePixels]:
         pixels = frame_pixels(surface, frame, scan, pattern, *poses, max_pixels=most)
-        masked, holes = len(pixels.row) * pixels.stride**2, find_holes(pixels, surface.diagonal)
-        return frame, frame_agreement(frame.name, masked, pixels, holes), pixels
+        return frame, frame_agreement(frame.name, pixels, surface.diagonal), pixels
 
     every = zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
     tasks = [partial(compare, *one) for one in every]

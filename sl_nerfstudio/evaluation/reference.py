@@ -9,7 +9,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.mesh_index import Closest, IndexedMesh, observable
+from sl_nerfstudio.evaluation.mesh_index import Closest, IndexedMesh, capture_views, observable
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, log_so3
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Scan
@@ -278,14 +278,11 @@ def mesh_reference(mesh: Mesh, scan: Scan, poses: DevicePoses, samples: int = 10
     """
     surface = IndexedMesh(mesh)
     points, normals = surface.sample(samples, seed + 1)
-    frames = [
-        (frame.camera, T_c, scan.projector, T_p)
-        for frame, T_c, T_p in zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
-    ]
-    seen = observable(points, normals, surface, frames)
+    views = capture_views(scan, poses)
+    seen = observable(points, normals, surface, views)
     # Almost nothing of a closed mesh is visible if it is inside out; with flipped normals, much more is.
     few = seen.mean() < 0.05
-    if not seen.any() or (few and observable(points, -normals, surface, frames).mean() > 4 * seen.mean()):
+    if not seen.any() or (few and observable(points, -normals, surface, views).mean() > 4 * seen.mean()):
         raise UserError(
             "no part of the reference mesh is both seen by a camera and lit by its projector\n"
             f"    cause:  it is inside out, in another unit than the scan ({scan.units}), or in other axes\n"

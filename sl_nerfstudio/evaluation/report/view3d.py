@@ -192,7 +192,7 @@ def mesh_scene(
     `numbers` are the frames' places among all captures.
     """
     small, nearest = decimated(surface.mesh)
-    normals = surface.vertex_normals[nearest]
+    normals = surface.mesh.vertex_normals()[nearest]
     shown = ShownSurface(
         small.vertices,
         normals,
