@@ -13,12 +13,7 @@ from scipy.spatial import KDTree
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.errors import UserError, first_line
-from sl_nerfstudio.evaluation.agreement import (
-    CaptureAgreement,
-    FrameAgreement,
-    FramePixels,
-    compare_captures,
-)
+from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement, FramePixels, compare_captures
 from sl_nerfstudio.evaluation.completeness import Completeness, assess_completeness
 from sl_nerfstudio.evaluation.mesh_faults import MeshFault, find_mesh_faults, missed_axes
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
