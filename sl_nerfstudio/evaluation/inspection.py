@@ -84,7 +84,8 @@ def inspect(
     indexed = IndexedMesh(part)
     deviation = indexed.signed_distance(S_part_mesh.points(mesh.vertices))
     sigma = None if quality is None else quality.sigma * S_part_mesh.scale
-    area = _vertex_areas(mesh) * S_part_mesh.scale**2
+    thirds = np.repeat(mesh.face_areas() / 3, 3)  # of the triangles around each vertex
+    area = np.bincount(mesh.faces.ravel(), thirds, len(mesh.vertices)) * S_part_mesh.scale**2
     measured = area > 0 if sigma is None else np.isfinite(sigma) & (area > 0)
     if not measured.any():
         sigma, measured = None, area > 0
@@ -117,11 +118,6 @@ def inspect(
         patches=_patches(mesh, deviation, sigma, out, area, S_part_mesh),
         facet_error=facet_sag(indexed),
     )
-
-
-def _vertex_areas(mesh: Mesh) -> Float64[ndarray, "v"]:
-    """A third of the area of the triangles around each vertex."""
-    return np.bincount(mesh.faces.ravel(), np.repeat(mesh.face_areas() / 3, 3), len(mesh.vertices))
 
 
 def _patches(

@@ -227,8 +227,13 @@ def encode_glb(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, texture: Textur
         filters = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS}
         document["samplers"] = [{**filters, "wrapS": _CLAMPED, "wrapT": _CLAMPED}]
         document["textures"] = [{"sampler": 0, "source": 0}]
-    document["bufferViews"] = _views(parts, targets)
-    document["buffers"] = [{"byteLength": sum(map(len, parts))}]
+    views, at = [], 0
+    for part, target in zip(parts, targets, strict=True):
+        view = {"buffer": 0, "byteOffset": at, "byteLength": len(part)}
+        views.append(view if target is None else {**view, "target": target})
+        at += len(part)
+    document["bufferViews"] = views
+    document["buffers"] = [{"byteLength": at}]
     return _container(document, b"".join(parts))
 
 
@@ -264,16 +269,6 @@ def _accessor(view: int, array: ndarray) -> dict[str, Any]:
     if view == 0:  # positions must state their box
         found |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
     return found
-
-
-def _views(parts: list[bytes], targets: list[int | None]) -> list[dict[str, int]]:
-    """Say where in the buffer each part is, and what for."""
-    views, at = [], 0
-    for part, target in zip(parts, targets, strict=True):
-        view = {"buffer": 0, "byteOffset": at, "byteLength": len(part)}
-        views.append(view if target is None else {**view, "target": target})
-        at += len(part)
-    return views
 
 
 def _linear(colour: UInt8[ndarray, "*n"]) -> UInt16[ndarray, "*n"]:

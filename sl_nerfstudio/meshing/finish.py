@@ -1,7 +1,10 @@
 """Finishing a mesh: its observed part marked, holes filled, a closed solid, fewer triangles."""
 
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from operator import methodcaller
+from typing import Any
 
 import numpy as np
 import torch
@@ -146,17 +149,10 @@ def decimate(mesh: Mesh, triangles: int) -> Decimated:
 
     A mesh that has no more stays as it is.
     """
-    from sl_nerfstudio.late_imports import open3d as o3d
-
-    centre, scale = mesh.vertices.mean(0), max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
     fewer = mesh
     if len(mesh.faces) > triangles:
-        before = o3d.geometry.TriangleMesh(
-            o3d.utility.Vector3dVector((mesh.vertices - centre) / scale),
-            o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)),
-        )
-        after = before.simplify_quadric_decimation(triangles, boundary_weight=_BORDERS)
-        fewer = Mesh(np.asarray(after.vertices) * scale + centre, np.asarray(after.triangles).astype(np.int64))
+        collapse = methodcaller("simplify_quadric_decimation", triangles, boundary_weight=_BORDERS)
+        fewer = simplified(mesh, collapse)
         fewer = fewer.with_faces(np.ones(len(fewer.faces), dtype=bool))
     found = ClosestSurface(mesh).closest(fewer.vertices)
     back = ClosestSurface(fewer).closest(mesh.vertices).distance
@@ -168,6 +164,16 @@ def decimate(mesh: Mesh, triangles: int) -> Decimated:
         float(np.sqrt((back**2).mean())),
         float(max(back.max(), found.distance.max())),
     )
+
+
+def simplified(mesh: Mesh, simplify: Callable[[Any], Any]) -> Mesh:
+    """What `simplify` makes of the mesh as a TriangleMesh of open3d, in units of its size and about its middle."""
+    from sl_nerfstudio.late_imports import open3d as o3d
+
+    centre, scale = mesh.vertices.mean(0), max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
+    vertices = o3d.utility.Vector3dVector((mesh.vertices - centre) / scale)
+    after = simplify(o3d.geometry.TriangleMesh(vertices, o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))))
+    return Mesh(np.asarray(after.vertices) * scale + centre, np.asarray(after.triangles).astype(np.int64))
 
 
 _DENIED = 0.5

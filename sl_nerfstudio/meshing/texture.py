@@ -299,10 +299,11 @@ def surface_texture(mesh: Mesh, size: int, whole: Mesh, pictures: Pictures) -> T
     triangle, weights = draw_triangles(uv, size)
     texels = np.flatnonzero(triangle >= 0)
     image = np.full((size * size, 3), GREY, dtype=np.uint8)
-    surface, seen, pictures.task = _Surface(mesh, whole), 0, "colours of the texture"
+    closest, seen, pictures.task = None if mesh is whole else ClosestSurface(whole), 0, "colours of the texture"
     for first in range(0, len(texels), _AT_A_TIME):
         some = texels[first : first + _AT_A_TIME]
-        points, normals = surface.at(triangle.reshape(-1)[some], weights.reshape(-1, 3)[some])
+        at = triangle.reshape(-1)[some], weights.reshape(-1, 3)[some]
+        points, normals = _on_whole(mesh, whole, closest, *at)
         colours = pictures.colours(points, normals)
         image[some] = colours.rgb
         seen += int(colours.seen.sum())
@@ -313,27 +314,23 @@ def surface_texture(mesh: Mesh, size: int, whole: Mesh, pictures: Pictures) -> T
     return Textured(Texture(charts, filled), texel, seen / max(len(texels), 1), seconds)
 
 
-class _Surface:
-    """Points of a mesh, on the surface that it had before it was decimated."""
+def _on_whole(
+    mesh: Mesh, whole: Mesh, closest: ClosestSurface | None, triangle: Int[ndarray, "n"], weights: Float[ndarray, "n 3"]
+) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
+    """Places and unit normals on the whole mesh at weighted corners; weights beside a triangle are moved to its edge.
 
-    def __init__(self, mesh: Mesh, whole: Mesh) -> None:
-        self._mesh, self._whole, self._normals = mesh, whole, whole.vertex_normals()
-        self._closest = None if mesh is whole else ClosestSurface(whole)
-
-    def at(
-        self, triangle: Int[ndarray, "n"], weights: Float[ndarray, "n 3"]
-    ) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
-        """Places and unit normals at weighted corners; weights beside the triangle are moved to its edge."""
-        inside = np.maximum(weights, 0).astype(np.float64)
-        inside /= inside.sum(1, keepdims=True)
-        points = _mean(self._mesh.vertices, self._mesh.faces[triangle], inside)
-        if self._closest is not None:
-            found = self._closest.closest(points)
-            triangle, inside = found.triangle, found.weights
-            points = _mean(self._whole.vertices, self._whole.faces[triangle], inside)
-        normals = _mean(self._normals, self._whole.faces[triangle], inside)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return points, normals / np.where(length > 0, length, 1.0)
+    `closest` is of the whole mesh, None if it is the same.
+    """
+    inside = np.maximum(weights, 0).astype(np.float64)
+    inside /= inside.sum(1, keepdims=True)
+    points = _mean(mesh.vertices, mesh.faces[triangle], inside)
+    if closest is not None:
+        found = closest.closest(points)
+        triangle, inside = found.triangle, found.weights
+        points = _mean(whole.vertices, whole.faces[triangle], inside)
+    normals = _mean(whole.vertex_normals(), whole.faces[triangle], inside)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return points, normals / np.where(length > 0, length, 1.0)
 
 
 def _mean(

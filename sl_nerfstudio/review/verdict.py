@@ -90,7 +90,7 @@ class DepartedFrame:
     stated: bool = True  # by the scan; otherwise what is usual
 
 
-def departed_frames(scan: Scan, poses: DevicePoses, usual_deg: float = USUAL_FRAME_ROTATION_DEG) -> list[DepartedFrame]:
+def departed_frames(scan: Scan, poses: DevicePoses) -> list[DepartedFrame]:
     """Frames whose cameras are turned by far more than the uncertainty of their starts: stated, or else usual.
 
     Positions are not compared: they depend on turns by as much as the camera is away from what it sees.
@@ -98,7 +98,7 @@ def departed_frames(scan: Scan, poses: DevicePoses, usual_deg: float = USUAL_FRA
     found = []
     for frame, T_start, T_end in zip(scan.frames, scan.poses.T_world_camera, poses.T_world_camera, strict=True):
         stated = frame.pose_sigma
-        sigma = usual_deg if stated is None else stated.camera_rotation_deg
+        sigma = USUAL_FRAME_ROTATION_DEG if stated is None else stated.camera_rotation_deg
         turned = angle_deg(T_start[:3, :3].T @ T_end[:3, :3])
         if turned > _MOST_SIGMA * np.sqrt(3) * sigma:
             found.append(DepartedFrame(frame.name, turned, sigma, stated is not None))

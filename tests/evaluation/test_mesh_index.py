@@ -7,6 +7,7 @@ import trimesh
 from sl_nerfstudio.evaluation.mesh_index import CaptureView, IndexedMesh, nearest_on_triangle, observable
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
+from tests.meshing.solids import together
 
 from .faceted_scan import looking_at_origin
 from .shapes import sphere
@@ -29,9 +30,7 @@ def test_distance_is_to_the_triangles_not_to_their_corners_in_any_unit_and_anywh
 def test_samples_are_spread_evenly_by_area_and_repeat_with_the_seed() -> None:
     small = square(0.0, 1.0)
     large = square(5.0, 3.0)  # nine times the area, the same number of triangles
-    surface = IndexedMesh(
-        Mesh(np.concatenate([small.vertices, large.vertices]), np.concatenate([small.faces, large.faces + 4]))
-    )
+    surface = IndexedMesh(together(small, large))
     points, normals = surface.sample(20_000, seed=3)
     assert surface.area == pytest.approx(4 + 36)
     assert (points[:, 2] == 0).sum() == pytest.approx(2000, abs=2)  # stratified: exact up to a point at each end
@@ -131,12 +130,7 @@ def test_frames_add_up_but_camera_and_projector_must_belong_to_one_frame() -> No
 def test_what_is_hidden_or_out_of_the_picture_is_not_observed() -> None:
     ball = sphere(10.0, 60)
     shield = np.array([[30.0, -50, -50], [30.0, 50, -50], [30.0, 0, 80]])  # between the ball and the devices at +x
-    both = IndexedMesh(
-        Mesh(
-            np.concatenate([ball.vertices, shield]),
-            np.concatenate([ball.faces, [[0, 1, 2] + np.array(len(ball.vertices))]]),
-        )
-    )
+    both = IndexedMesh(together(ball, Mesh(shield, np.array([[0, 1, 2]]))))
     points, normals = IndexedMesh(ball).sample(500, 0)
     T = looking_at_origin(400.0, 0.0, 0.0)
     assert not observable(points, normals, both, [view(T, T)]).any()

@@ -9,6 +9,7 @@ from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import align_poses, compare_poses, icp
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
+from tests.meshing.solids import together
 
 from .shapes import blob, known_similarity, turn
 
@@ -65,10 +66,7 @@ def test_icp_brings_a_moved_mesh_back(with_scale: bool) -> None:
 def test_icp_ignores_invented_surface() -> None:
     truth = IndexedMesh(blob())
     plate = np.array([[-1.0, -1.0, 2.0], [1.0, -1.0, 2.0], [0.0, 1.0, 2.0]])
-    both = Mesh(
-        np.concatenate([blob().vertices, plate]),
-        np.concatenate([blob().faces, [[0, 1, 2] + np.array(len(blob().vertices))]]),
-    )
+    both = together(blob(), Mesh(plate, np.array([[0, 1, 2]])))
     S = known_similarity()
     found = icp(IndexedMesh(both.mapped(S.inverse())).sample(6000, 0)[0], truth, Similarity.identity(), True)
     assert_same(found.S_target_source, S, 1e-6)

@@ -9,20 +9,8 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
-from sl_nerfstudio.geometry.devices import (
-    Device,
-    Intrinsics,
-    project,
-    unproject,
-)
-from sl_nerfstudio.geometry.lie import (
-    DevicePoses,
-    Similarity,
-    exp_se3,
-    inverse,
-    rotate,
-    transform,
-)
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3, inverse, rotate, transform
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 from sl_nerfstudio.meshing.uncertainty import (
     AVERAGED_CELLS,
@@ -46,7 +34,7 @@ from sl_nerfstudio.scan import Scan
 from tests.bundle_adjustment.analytic import look_at
 
 from .ray_cast_scan import pairs_around, scan_of
-from .test_visibility import plate
+from .solids import plate, together
 
 CAMERA = Device(300, 300, 410.0, 400.0, 148.0, 152.0, k1=-0.1, p1=0.002)
 LIGHTS = (
@@ -346,8 +334,7 @@ def test_vertices_that_no_frame_confirms_are_marked(scan: Scan):
     height = 10 * np.exp(-(x.vertices[:, 0] ** 2 + (x.vertices[:, 1] - 5) ** 2) / 300)
     top = Mesh(x.vertices + height[:, None] * [0, 0, 1], x.faces)
     count = len(top.vertices)
-    below = top.vertices - [0.0, 0.0, 5.0]
-    mesh = Mesh(np.concatenate([top.vertices, below]), np.concatenate([top.faces, top.faces[:, ::-1] + count]))
+    mesh = together(top, Mesh(top.vertices - [0.0, 0.0, 5.0], top.faces[:, ::-1]))
     found: VertexQuality = vertex_uncertainty(mesh, scan, scan.poses, random_joint(), CELL)
     inside = np.abs(top.vertices[:, :2]).max(1)
     assert (found.views[:count][inside < 25] > 0).all() and (found.views[:count][inside > 33] == 0).all()

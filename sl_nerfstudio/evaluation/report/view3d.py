@@ -26,6 +26,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.triangulation import OUTLINE, beside, frustum, world_pixels
 from sl_nerfstudio.late_imports import open3d as o3d
+from sl_nerfstudio.meshing.finish import simplified
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.processing.scan_poses import PlacedFrame, PlacedGroup
 from sl_nerfstudio.scan import Scan
@@ -162,20 +163,15 @@ def decimated(mesh: Mesh, most: int = MOST_TRIANGLES) -> tuple[Mesh, ndarray]:
     """The mesh reduced to about `most` triangles, and for each of its vertices the nearest one of the original."""
     if len(mesh.faces) <= most:
         return mesh, np.arange(len(mesh.vertices))
-    centre = mesh.vertices.mean(0)
-    size = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
-    plain = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector((mesh.vertices - centre) / size),
-        o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)),
-    )
-    if len(mesh.faces) > 5 * most:  # first a coarse pass: precise decimation of a million triangles takes 10 s
-        cell = float(np.sqrt(mesh.face_areas().sum() / most)) / size
-        plain = plain.simplify_vertex_clustering(cell, o3d.geometry.SimplificationContraction.Average)
-    small = plain.simplify_quadric_decimation(most)
-    vertices = np.asarray(small.vertices) * size + centre
-    used = np.unique(mesh.faces)
-    nearest = used[np.asarray(KDTree(mesh.vertices[used]).query(vertices)[1])]
-    return Mesh(vertices, np.asarray(small.triangles).astype(np.int64)), nearest
+
+    def simplify(plain: o3d.geometry.TriangleMesh) -> o3d.geometry.TriangleMesh:
+        if len(mesh.faces) > 5 * most:  # first a coarse pass: precise decimation of a million triangles takes 10 s
+            cell = float(np.sqrt(mesh.face_areas().sum() / most)) / float(np.ptp(mesh.vertices, axis=0).max())
+            plain = plain.simplify_vertex_clustering(cell, o3d.geometry.SimplificationContraction.Average)
+        return plain.simplify_quadric_decimation(most)
+
+    small, used = simplified(mesh, simplify), np.unique(mesh.faces)
+    return small, used[np.asarray(KDTree(mesh.vertices[used]).query(small.vertices)[1])]
 
 
 def mesh_scene(
