@@ -513,12 +513,10 @@ def read_pairs(path: Path) -> list[PointPair]:
             f"--distances {path}: cannot be read ({first_line(error)})\n"
             "    remedy: give a text file with a line such as `handle: 12.5,-3,40 10,2,38` for each distance"
         ) from error
-    kept = [
-        (number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")
-    ]
+    kept = {number: line for number, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != "#"}
     if not kept:
         raise UserError(f"--distances {path}: holds no distances\n    remedy: give a line `name: x,y,z x,y,z` for each")
-    return [parse_pair(line, f"{path}, line {number}") for number, line in kept]
+    return [parse_pair(line, f"{path}, line {number}") for number, line in kept.items()]
 
 
 def measure_lengths(
@@ -552,19 +550,10 @@ def measure_lengths(
     if quality is not None and joint is not None:
         found = length_sigma(mesh, quality.sigma_independent, vertices, scan, poses, joint)
         shared, independent = found.shared, found.independent
-    views = None if quality is None else quality.views[vertices]
+    views = [None if quality is None else (int(quality.views[a]), int(quality.views[b])) for a, b in vertices]
     return [
-        Length(
-            pair.name,
-            _triple(ends[k, 0]),
-            _triple(ends[k, 1]),
-            float(lengths[k]),
-            _known(float(np.hypot(shared[k], independent[k]))),
-            _known(float(shared[k])),
-            _known(float(independent[k])),
-            None if views is None else (int(views[k, 0]), int(views[k, 1])),
-        )
-        for k, pair in enumerate(pairs)
+        Length(pair.name, _triple(p), _triple(q), float(length), _known(np.hypot(a, b)), _known(a), _known(b), seen)
+        for pair, (p, q), length, a, b, seen in zip(pairs, ends, lengths, shared, independent, views, strict=True)
     ]
 
 
@@ -582,15 +571,15 @@ def typical_sigma(
     if not long.any():
         return None
     found = length_sigma(mesh, quality.sigma_independent, ends[long], scan, poses, joint)
-    return _known(float(np.nanmedian(np.hypot(found.shared, found.independent) / length[long])))
+    return _known(np.nanmedian(np.hypot(found.shared, found.independent) / length[long]))
 
 
 def _triple(p: Float[ndarray, "3"]) -> tuple[float, float, float]:
     return float(p[0]), float(p[1]), float(p[2])
 
 
-def _known(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+def _known(value: float | np.floating) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def _off_surface(pair: PointPair, point: Float[ndarray, "3"], away: float, surface: IndexedMesh, units: str) -> str:

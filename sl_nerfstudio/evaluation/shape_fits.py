@@ -95,8 +95,7 @@ def fit_shape(
     errors of poses and intrinsics. Raises UserError if the region holds too little surface, or has no such radius.
     """
     used = np.unique(mesh.faces)
-    chosen = used[KDTree(mesh.vertices[used]).query_ball_point(region.point, region.radius)]
-    chosen = np.sort(chosen)
+    chosen = np.sort(used[KDTree(mesh.vertices[used]).query_ball_point(region.point, region.radius)])
     if len(chosen) < _FEWEST:
         low, high = (",".join(f"{v:.4g}" for v in corner) for corner in mesh.bounds())
         raise UserError(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
 from typing import Any
@@ -34,7 +34,7 @@ from sl_nerfstudio.evaluation.report.charts import (
     residual_colours,
     shrink,
 )
-from sl_nerfstudio.evaluation.report.view3d import View, mesh_scene
+from sl_nerfstudio.evaluation.report.view3d import mesh_scene
 from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.parallel import results
@@ -202,17 +202,6 @@ class ReportInput:
         return "" if path is None else f"{path.parent.name}/{path.name}"
 
 
-@dataclass(frozen=True)
-class SurfacePictures:
-    """Shaded views of the surface, with error colours where there is a reference."""
-
-    views: list[str]  # data addresses
-    view: View
-    scale: ColourScale | None
-    layers: list[str]  # names of what the interactive view can be coloured by
-    histogram: str  # SVG, "" without a reference
-
-
 def render_report(report: ReportInput) -> str:
     """The page as text."""
     evaluation, scan = report.evaluation, report.inputs.scan
@@ -265,36 +254,35 @@ def _main_figures(report: ReportInput) -> list[tuple[str, str, str]]:
     return [(f"{name}: {before}" if before else name, value, after) for name, (before, value, after) in named]
 
 
-def _parts(report: ReportInput) -> tuple[SurfacePictures, list[Comparison], dict[str, Any] | None]:
+def _parts(report: ReportInput) -> tuple[dict[str, Any], list[Comparison], dict[str, Any] | None]:
     """What takes long, side by side. Matplotlib's settings belong to the process: one task draws with it at a time."""
     surface = IndexedMesh(report.inputs.mesh)
     compare = partial(compare_frames, surface, report.inputs.scan, report.evaluation.agreement, report.inputs.poses)
     pictures_of, changes_of = partial(_surface_pictures, report, surface), partial(_pose_changes, report)
     tasks: list[Callable[[], Any]] = [pictures_of, changes_of, compare]
     (pictures, errors), changes, comparisons = results(tasks)
-    if errors is not None and pictures.scale is not None:
-        title, units = "Signed distance of the surface from the reference", report.evaluation.truth_units
-        histogram = charts.histogram(title, units, errors, pictures.scale.lower, pictures.scale.upper)
-        pictures = replace(pictures, histogram=histogram)
+    if errors is not None:
+        title, scale = "Signed distance of the surface from the reference", pictures["scale"]
+        shown = charts.histogram(title, report.evaluation.truth_units, errors, scale.lower, scale.upper)
+        pictures["histogram"] = shown
     return pictures, comparisons, changes
 
 
-def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[SurfacePictures, Float[ndarray, "n"] | None]:
-    """The pictures without the histogram, and the errors that it shows."""
+def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[dict[str, Any], Float[ndarray, "n"] | None]:
+    """Shaded views of the surface, with error colours where there is a reference, and the errors of its histogram."""
     values, scale = _errors(report, surface, surface.vertices)
     colours = None if values is None or scale is None else scale(values)
     views = camera_views(report.inputs.poses.T_world_camera, surface.centre)
     units = report.evaluation.truth_units
     layers = [*colour_layers(values, scale, report.inputs.quality, report.evaluation.units, units), *report.layers]
-    quality = report.inputs.quality
-    sigma = None if quality is None else quality.sigma
+    sigma = None if report.inputs.quality is None else report.inputs.quality.sigma
     scan, record = report.inputs.scan, report.inputs.record
     numbers = {frame.name: k for k, frame in enumerate(scan.frames)}
     numbers |= {} if record is None else {frame.name: k for k, frame in enumerate(record.frames)}
     view = mesh_scene(surface, layers, scan, report.inputs.poses, numbers, sigma, report.inputs.colour)
     errors = None if scale is None else _errors(report, surface, surface.sample(50_000, 0)[0])[0]
-    drawn = [data_uri(render(surface, v, colours)) for v in views]
-    return SurfacePictures(drawn, view, scale, [layer.name for layer in layers], ""), errors
+    drawn, names = [data_uri(render(surface, v, colours)) for v in views], [layer.name for layer in layers]
+    return {"views": drawn, "view": view, "scale": scale, "layers": names, "histogram": ""}, errors
 
 
 def _errors(
