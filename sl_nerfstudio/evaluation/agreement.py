@@ -16,7 +16,7 @@ from scipy.ndimage import binary_opening, label, map_coordinates
 
 from sl_nerfstudio.console import track
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.geometry.lie import DevicePoses, inverse, transform
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
 from sl_nerfstudio.geometry.triangulation import epipolar_residual, pixel_rays, triangulate
@@ -92,8 +92,12 @@ def frame_pixels(
     origin, direction = (x.numpy() for x in pixel_rays(camera, T_c, uv))
     hits = surface.cast(origin, direction)
     p_world = origin + hits.distance[:, None] * direction
-    predicted, reached = _predict(p_world, hits.hit, surface, scan.projector, projector, T_p)
-    predicted[~hits.hit] = np.nan
+    p_projector = transform(inverse(T_p), torch.as_tensor(np.nan_to_num(p_world)))
+    uv_projector, in_front = (x.numpy() for x in project(projector, p_projector))
+    predicted = np.where((hits.hit & in_front)[:, None], uv_projector, np.nan)
+    reached = ((predicted >= 0) & (predicted < (scan.projector.w, scan.projector.h))).all(1)
+    candidates = np.flatnonzero(reached)
+    reached[candidates] = ~surface.occluded(p_world[candidates], T_world_projector[:3, 3])
     rendered = np.where(reached, look_up(pattern, predicted), np.nan)
     measured = triangulate(camera, T_c, uv, projector, T_p, torch.nan_to_num(decoded_uv)).depth_camera.numpy()
 
@@ -120,25 +124,6 @@ def frame_pixels(
         noise_px=float(np.nan_to_num(max(MAD_TO_SIGMA * _median(np.abs(epipolar)), _FOOTPRINT * footprint))),
         footprint_px=footprint,
     )
-
-
-def _predict(
-    p_world: Float[ndarray, "n 3"],
-    hit: Bool[ndarray, "n"],
-    surface: IndexedMesh,
-    device: Device,
-    projector: Intrinsics,
-    T_world_projector: torch.Tensor,
-) -> tuple[Float[ndarray, "n 2"], Bool[ndarray, "n"]]:
-    """Pattern coordinates of surface points, and whether the projector really lights them."""
-    p_device = transform(inverse(T_world_projector), torch.as_tensor(np.nan_to_num(p_world)))
-    uv, in_front = project(projector, p_device)
-    uv = uv.numpy()
-    x, y = uv.T
-    reached = hit & in_front.numpy() & (x >= 0) & (x < device.w) & (y >= 0) & (y < device.h)
-    candidates = np.flatnonzero(reached)
-    reached[candidates] = ~surface.occluded(p_world[candidates], T_world_projector[:3, 3].numpy())
-    return np.where(in_front.numpy()[:, None], uv, np.nan), reached
 
 
 def look_up(image: Float[ndarray, "h w"], uv: Float[ndarray, "n 2"]) -> Float[ndarray, "n"]:

@@ -22,7 +22,7 @@ from sl_nerfstudio.meshing import visibility as loops
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 from sl_nerfstudio.meshing.visibility import LEAST_PX, MEDIANS, MOST_PX, Occluder, dot, lit_vertices, write_rows
 from sl_nerfstudio.parallel import compiled_range, parallel, results, threads
-from sl_nerfstudio.scan.types import Frame, Scan
+from sl_nerfstudio.scan.types import Scan
 
 # How the residuals of one frame depend on the surface, on the frame's poses and on the intrinsics.
 #
@@ -146,29 +146,21 @@ def views_by_frame(
     predicts. As many frames are in memory at a time as there are threads.
     """
     chosen = np.arange(len(mesh.vertices), dtype=np.int64) if chosen is None else chosen
-    points, normals = mesh.vertices, mesh.vertex_normals()
-    occluder, all_frames = Occluder(mesh), list(enumerate(scan.frames))
-    for first in track(range(0, len(all_frames), threads()), task):
-        frames = all_frames[first : first + threads()]
-        yield from results(
-            [partial(_views_of, points, normals, chosen, occluder, f, scan, poses, k) for k, f in frames]
-        )
+    points, normals, occluder = mesh.vertices, mesh.vertex_normals(), Occluder(mesh)
+
+    def views(k: int) -> FrameViews:
+        frame, T = scan.frames[k], (poses.T_world_camera[k], poses.T_world_projector[k])
+        seen, _ = lit_vertices(points, normals, chosen, occluder, frame.camera, scan.projector, *T)
+        view = view_surface(devices_of(scan, poses, k), torch.from_numpy(points[seen]), torch.from_numpy(normals[seen]))
+        return _confirmed(seen, view, frame.read_coords())
+
+    numbers = range(len(scan.frames))
+    for first in track(numbers[:: threads()], task):
+        yield from results([partial(views, k) for k in numbers[first : first + threads()]])
 
 
-def _views_of(
-    points: Float[ndarray, "v 3"],
-    normals: Float[ndarray, "v 3"],
-    chosen: Int64[ndarray, "c"],
-    occluder: Occluder,
-    frame: Frame,
-    scan: Scan,
-    poses: DevicePoses,
-    k: int,
-) -> FrameViews:
-    T = poses.T_world_camera[k], poses.T_world_projector[k]
-    seen, _ = lit_vertices(points, normals, chosen, occluder, frame.camera, scan.projector, *T)
-    devices, coords = devices_of(scan, poses, k), frame.read_coords()
-    view = view_surface(devices, torch.from_numpy(points[seen]), torch.from_numpy(normals[seen]))
+def _confirmed(seen: Int64[ndarray, "n"], view: SurfaceView, coords: Float[ndarray, "h w 2"]) -> FrameViews:
+    """The vertices, of those that a frame sees, whose predictions its decoded coordinates confirm."""
     uv = view.uv_camera.numpy()
     column, row = np.floor(uv).astype(np.int64).T
     at_pixel = np.einsum("nij,nj->ni", view.by_pixel.numpy(), np.stack([column, row], 1) + 0.5 - uv)

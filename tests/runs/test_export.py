@@ -38,12 +38,8 @@ def test_the_facts_are_those_of_the_files(scan: Scan, tmp_path):
     assert record == json.loads(json.dumps(training_record(run, settings)))
     assert " ".join(record["commands"]["export"]).endswith(f"{tmp_path / 'refined'} --resolution 128 --overwrite")
     assert record["commands"]["train"][:3] == ["ns-train", "sl-neus", "--data"]
-    assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) == [
-        "mesh.ply",
-        "pose_covariance.npz",
-        "training.json",
-        "transforms.json",
-    ]
+    files = sorted(p.name for p in tmp_path.rglob("*") if p.is_file())
+    assert files == ["mesh.ply", "pose_covariance.npz", "training.json", "transforms.json"]
 
 
 def test_without_trimming_the_ball_is_closed_and_no_poses_are_written_unless_wanted(scan: Scan, tmp_path):

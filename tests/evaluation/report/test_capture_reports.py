@@ -166,7 +166,7 @@ def test_unordered_captures_have_no_neighbours_between_which_to_add():
 def test_discs_lie_in_the_surface_and_face_the_camera_that_saw_them():
     group = PlacedGroup(0, (_placed("a", 0.0, 900), _placed("b", 0.5, 700)))  # points of a unit sphere
     surface = placed_surface(group, {"a": 0, "b": 4})
-    eyes = np.array([frame.T_world_camera[:3, 3] for frame in group.frames])[surface.seen.frame]
+    eyes = np.array([frame.T_world_camera[:3, 3] for frame in group.frames])[surface.frame]
     np.testing.assert_allclose(np.abs((surface.normals * surface.points).sum(1)), 1, atol=0.05)
     assert ((eyes - surface.points) * surface.normals).sum(1).min() > 0
     assert 1 < surface.radius / (4 * np.pi / 1600) ** 0.5 < 3  # they cover it, and not much more
