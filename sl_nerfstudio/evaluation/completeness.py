@@ -116,14 +116,9 @@ def assess_completeness(surface: IndexedMesh, agreement: CaptureAgreement) -> Co
     """What the surface has of what was decoded, and where it ends."""
     decoded = np.array([frame.pixels * frame.decoded_share for frame in agreement.frames])
     missing = float((decoded * [frame.hole_share for frame in agreement.frames]).sum())
-    openings = find_openings(surface.mesh)
+    observed = 1 - missing / decoded.sum() if decoded.sum() else float("nan")
     noise = max(MAD_TO_SIGMA * float(np.nan_to_num(agreement.epipolar_px_median)), _LEAST_NOISE_PX)
-    return Completeness(
-        observed=1 - missing / decoded.sum() if decoded.sum() else float("nan"),
-        surface_area=surface.area,
-        openings=openings,
-        noise_px=noise,
-    )
+    return Completeness(observed, surface.area, find_openings(surface.mesh), noise)
 
 
 # How well each place of a surface is known from the frames that see it, and what one more frame would add.

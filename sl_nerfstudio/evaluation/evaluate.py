@@ -463,8 +463,8 @@ def _missed(surface: IndexedMesh, scan: Scan, poses: DevicePoses) -> str:
 
 _OFF_SURFACE = 0.02  # of the mesh's diagonal: a point that is farther away was not meant to be on this mesh
 _TYPICAL, _LONG = 400, 0.3  # how many distances say what is typical, and the shortest one, of the mesh's diagonal
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_POINT = rf"{_NUMBER},{_NUMBER},{_NUMBER}"
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+POINT = rf"{NUMBER},{NUMBER},{NUMBER}"
 
 
 @dataclass(frozen=True)
@@ -493,7 +493,7 @@ class Length:
 def parse_pair(text: str, where: str) -> PointPair:
     """A pair from "x,y,z x,y,z", with "name:" before it if wanted. Raises UserError; `where` is the flag or line."""
     name, colon, rest = text.rpartition(":")
-    found = re.fullmatch(rf"\s*({_POINT})\s+({_POINT})\s*", rest)
+    found = re.fullmatch(rf"\s*({POINT})\s+({POINT})\s*", rest)
     if found is None or (colon and not name.strip()):
         raise UserError(
             f"{where}: {text.strip()!r:.100} is not two points\n"

@@ -139,15 +139,9 @@ def _patches(
             d, a = deviation[corners], area[corners]
             peak = corners[int(np.abs(d).argmax())]
             x, y, z = S_part_mesh.points(mesh.vertices[peak]).tolist()
-            found.append(
-                Patch(
-                    (x, y, z),
-                    float(a.sum()),
-                    float(a @ d / a.sum()),
-                    side * float(np.percentile(np.abs(d), _HIGHEST)),
-                    None if sigma is None else float(np.median(sigma[corners])),
-                )
-            )
+            height = side * float(np.percentile(np.abs(d), _HIGHEST))
+            usual = None if sigma is None else float(np.median(sigma[corners]))
+            found.append(Patch((x, y, z), float(a.sum()), float(a @ d / a.sum()), height, usual))
     return tuple(sorted(found, key=lambda patch: -patch.area)[:_MOST_PATCHES])
 
 

@@ -381,10 +381,8 @@ def judge(
     reasons += [Reason("poor", f"{name}: could not be placed", "again") for name in unplaced]
     reasons += departed_reasons([one for one in departed if one.name not in unplaced])
     verdict = worst(reasons).with_help(HELP)
-    return Judgement(
-        verdict, _sentence(verdict.band, evaluation), tuple(figures), _hints(evaluation, verdict.band, intrinsics),
-        capture_next(evaluation, capture),
-    )  # fmt: skip
+    sentence, hints = _sentence(verdict.band, evaluation), _hints(evaluation, verdict.band, intrinsics)
+    return Judgement(verdict, sentence, tuple(figures), hints, capture_next(evaluation, capture))
 
 
 def _accuracy(evaluation: Evaluation) -> JudgedFigure:

@@ -175,15 +175,8 @@ def place_on_part(result: Mesh, part: Mesh, with_scale: bool = False, seed: int 
     equal = _completed([S for S, cost in zip(places, costs, strict=True) if cost <= fits], every, motions, fits)
     turns = [(S @ places[0].inverse()).R for S in equal[1:]]
     worse = [S for S, cost in zip(places[1:], costs[1:], strict=True) if cost > fits]
-    return PartAlignment(
-        places[0],
-        in_place,
-        every.rms(places[0]),
-        min(indexed.diagonal, places[0].scale * whole.diagonal),
-        motions,
-        tuple(turns),
-        every.rms(worse[0]) if worse else None,
-    )
+    size, next_rms = min(indexed.diagonal, places[0].scale * whole.diagonal), every.rms(worse[0]) if worse else None
+    return PartAlignment(places[0], in_place, every.rms(places[0]), size, motions, tuple(turns), next_rms)
 
 
 def _completed(equal: list[Similarity], points: _Points, motions: OpenMotions, fits: float) -> list[Similarity]:

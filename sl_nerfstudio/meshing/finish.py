@@ -76,11 +76,8 @@ class ClosestSurface:
         found = self._scene.compute_closest_points(self._scaled(points))
         u, v = found["primitive_uvs"].numpy().T.astype(np.float64)
         there = found["points"].numpy() * self._scale + self._centre
-        return ClosestPoints(
-            np.linalg.norm(points - there, axis=1).astype(np.float64),
-            found["primitive_ids"].numpy().astype(np.int64),
-            np.stack([1 - u - v, u, v], 1),
-        )
+        distance = np.linalg.norm(points - there, axis=1).astype(np.float64)
+        return ClosestPoints(distance, found["primitive_ids"].numpy().astype(np.int64), np.stack([1 - u - v, u, v], 1))
 
 
 # A field whose zero level is closed: it ends at the walls of its box, and at planes.
@@ -156,14 +153,9 @@ def decimate(mesh: Mesh, triangles: int) -> Decimated:
         fewer = fewer.with_faces(np.ones(len(fewer.faces), dtype=bool))
     found = ClosestSurface(mesh).closest(fewer.vertices)
     back = ClosestSurface(fewer).closest(mesh.vertices).distance
-    return Decimated(
-        fewer,
-        mesh.faces[found.triangle, found.weights.argmax(1)],
-        found.distance,
-        len(mesh.faces),
-        float(np.sqrt((back**2).mean())),
-        float(max(back.max(), found.distance.max())),
-    )
+    nearest = mesh.faces[found.triangle, found.weights.argmax(1)]
+    rms, largest = float(np.sqrt((back**2).mean())), float(max(back.max(), found.distance.max()))
+    return Decimated(fewer, nearest, found.distance, len(mesh.faces), rms, largest)
 
 
 def simplified(mesh: Mesh, simplify: Callable[[Any], Any]) -> Mesh:

@@ -560,11 +560,10 @@ def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], counts: FrameCounts) -
     bordering = np.zeros(count, dtype=bool)
     mixed = edges[observed[edges[:, 0]] != observed[edges[:, 1]]]
     bordering[label[mixed[gap[mixed]]]] = True
-    members = np.bincount(label[gap], minlength=count)
-    several = np.bincount(label[gap], (counts.contradicted[gap] >= _SEVERAL).astype(float), count)
-    in_mask = np.bincount(label[gap], (counts.inconclusive[gap] > 0).astype(float), count)
-    silent, denied = (
-        np.bincount(label[gap], v[gap].astype(float), count) for v in (counts.inconclusive, counts.contradicted)
+    silence, denial = counts.inconclusive, counts.contradicted
+    members, several, in_mask, silent, denied = (
+        np.bincount(label[gap], values[gap].astype(float), count)
+        for values in (gap, denial >= _SEVERAL, silence > 0, silence, denial)
     )
     undecoded = (in_mask > UNDECODED_MEMBERS * members) & (denied < CONTRADICTED * silent)
     share = np.where(undecoded, UNDECODED_HOLE_SHARE, HOLE_SHARE)

@@ -56,14 +56,9 @@ class PosedFrames:
 
 def posed_frames(scan: Scan, poses: DevicePoses, unplaced: Sequence[bool]) -> PosedFrames:
     """The devices of a scan at refined poses."""
-    cameras = tuple(
-        PosedDevice(frame.name, frame.camera, T, frame.image_path)
-        for frame, T in zip(scan.frames, poses.T_world_camera, strict=True)
-    )
-    projectors = tuple(
-        PosedDevice(frame.name, scan.projector, T, scan.pattern_path)
-        for frame, T in zip(scan.frames, poses.T_world_projector, strict=True)
-    )
+    every = list(zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True))
+    cameras = tuple(PosedDevice(f.name, f.camera, T, f.image_path) for f, T, _ in every)
+    projectors = tuple(PosedDevice(f.name, scan.projector, T, scan.pattern_path) for f, _, T in every)
     return PosedFrames(cameras, projectors, tuple(not lost for lost in unplaced))
 
 
@@ -181,8 +176,8 @@ def encode_blender(frames: PosedFrames, unit_m: float | None) -> bytes:
     factor = unit_m or 1.0
     size = 0.1 * factor * _distance(frames)
     devices = {
-        "cameras": _records(frames.cameras, frames.placed, "camera", factor, size),
-        "projectors": _records(frames.projectors, frames.placed, "projector", factor, size),
+        f"{kind}s": _records(posed, frames.placed, kind, factor, size)
+        for kind, posed in (("camera", frames.cameras), ("projector", frames.projectors))
     }
     text = _SCRIPT.replace("@DEVICES@", json.dumps(devices, indent=1, ensure_ascii=True))
     text = text.replace("@UNIT@", "metres" if unit_m else "the scan's arbitrary unit").replace("@SCALE@", f"{factor:g}")

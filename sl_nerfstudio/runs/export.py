@@ -236,12 +236,12 @@ def separate_scan(scan: Scan, poses: DevicePoses) -> Separation:
     return separate(frames)
 
 
-def cut_object(mesh: Mesh, found: Separation, kept: Bool[ndarray, "f"] | None = None) -> ObjectCut:
-    """Keep the given triangles; by default all but planes around the object and what is not connected to it.
+def cut_object(mesh: Mesh, found: Separation, chosen: Bool[ndarray, "f"] | None = None) -> ObjectCut:
+    """Keep the chosen triangles; by default all but planes around the object and what is not connected to it.
 
     Raises UserError if nothing is left.
     """
-    kept = found.keeps(mesh.vertices)[mesh.faces].all(1) if kept is None else kept
+    kept = found.keeps(mesh.vertices)[mesh.faces].all(1) if chosen is None else chosen
     if not kept.any():
         raise UserError(
             "--object-only leaves nothing of the surface\n"

@@ -373,7 +373,7 @@ def check_run(path: Path) -> RunCheck:
     Raises UserError, with everything that is wrong once config.yml could be read.
     """
     file = config_file(path)
-    config = read_config(file)
+    config: Any = read_config(file)
     saved = checkpoints_in(last_checkpoint(config, file).parent)
     faults: list[str] = []
     good: list[Checkpoint] = []

@@ -30,12 +30,7 @@ def assert_same(found: Similarity, expected: Similarity, tolerance: float) -> No
 
 
 @settings(max_examples=20)
-@given(
-    count=st.integers(2, 8),
-    degrees=st.floats(0, 179),
-    scale=st.floats(0.2, 5.0),
-    seed=st.integers(0, 1000),
-)
+@given(count=st.integers(2, 8), degrees=st.floats(0, 179), scale=st.floats(0.2, 5.0), seed=st.integers(0, 1000))
 def test_poses_moved_by_a_similarity_come_back(count: int, degrees: float, scale: float, seed: int) -> None:
     true = random_poses(count, seed)
     S = Similarity(scale, turn((0.3, -1.0, 0.7), degrees), np.array([10.0, -20.0, 5.0]))

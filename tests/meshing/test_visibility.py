@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +21,7 @@ from sl_nerfstudio.meshing.visibility import (
     OFF_MASK_PX,
     FrameCounts,
     Occluder,
+    Trimmed,
     compare_decoded,
     count_frames,
     packed_device,
@@ -259,8 +259,13 @@ def ball_scan(truth, tmp_path_factory):
     return scan_of(truth, RING, tmp_path_factory.mktemp("trim") / "scan")
 
 
-def test_the_unseen_side_of_a_ball_is_cut_at_its_horizon(truth, ball_scan):
-    result = trim_to_observed(truth, ball_scan)
+@pytest.fixture(scope="module")
+def result(truth, ball_scan) -> Trimmed:
+    """What is kept of the ball."""
+    return trim_to_observed(truth, ball_scan)
+
+
+def test_the_unseen_side_of_a_ball_is_cut_at_its_horizon(truth, result):
     kept = contains(result.mesh, truth.vertices)
     margin = angle_beyond_horizon_deg(truth.vertices)
     assert kept[margin > 18].all()  # the last pixel of the ball's image is 18 degrees of it
@@ -355,13 +360,13 @@ def test_wrongly_decoded_cells_make_no_hole(truth, faces_observed, tmp_path, fra
     assert frames > 1 or result.closed > 0
 
 
-def test_noise_of_coordinates_and_poses_cuts_nothing(truth, ball_scan, tmp_path):
+def test_noise_of_coordinates_and_poses_cuts_nothing(truth, result, tmp_path):
     rng = np.random.default_rng(0)
     noisy = scan_of(truth, RING, tmp_path / "scan", lambda i, c: c + rng.normal(0, 1, c.shape).astype(np.float32))
     tilt = exp_se3(torch.tensor([0.5, -0.5, 0.5, 0.003, 0.002, -0.003], dtype=torch.float64)).numpy()
     moved = DevicePoses(noisy.poses.T_world_camera @ tilt, noisy.poses.T_world_projector)
     faces = len(trim_to_observed(truth, noisy, moved).mesh.faces)
-    assert faces == pytest.approx(len(trim_to_observed(truth, ball_scan).mesh.faces), rel=0.02)
+    assert faces == pytest.approx(len(result.mesh.faces), rel=0.02)
 
 
 def test_shadows_and_hidden_parts_of_a_plane(tmp_path):
@@ -439,11 +444,11 @@ def covered_pixels(T_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
     return out
 
 
-def test_given_poses_replace_those_of_the_scan(truth, ball_scan):
+def test_given_poses_replace_those_of_the_scan(truth, ball_scan, result):
     R = exp_so3(torch.tensor([0.3, -0.2, 0.9], dtype=torch.float64)).numpy()
     S = Similarity(1.0, R, np.array([500.0, -20, 7]))
     moved = trim_to_observed(truth.mapped(S), ball_scan, ball_scan.poses.mapped(S)).mesh
-    assert len(moved.faces) == pytest.approx(len(trim_to_observed(truth, ball_scan).mesh.faces), rel=2e-3)
+    assert len(moved.faces) == pytest.approx(len(result.mesh.faces), rel=2e-3)
 
 
 def test_wrong_poses_say_so(truth, ball_scan):
@@ -459,6 +464,6 @@ def test_another_surface_says_so(ball_scan):
         trim_to_observed(ball((0.0, 0.0, -70.0), 25.0), ball_scan)
 
 
-def test_missing_mask_files_mean_decoded_pixels(truth, ball_scan, tmp_path: Path):
+def test_missing_mask_files_mean_decoded_pixels(truth, ball_scan, result):
     without = replace(ball_scan, frames=tuple(replace(f, mask_path=None) for f in ball_scan.frames))
-    assert len(trim_to_observed(truth, without).mesh.faces) == len(trim_to_observed(truth, ball_scan).mesh.faces)
+    assert len(trim_to_observed(truth, without).mesh.faces) == len(result.mesh.faces)
