@@ -68,8 +68,8 @@ class Mesh:
 
     @cached_property
     def _normals(self) -> Float64[ndarray, "v 3"]:
-        corner, cross = self.faces.ravel(), np.repeat(self.face_cross(), 3, axis=0)
-        out = np.stack([np.bincount(corner, values, len(self.vertices)) for values in cross.T], -1)
+        corner, count = self.faces.ravel(), len(self.vertices)
+        out = np.stack([np.bincount(corner, np.repeat(values, 3), count) for values in self.face_cross().T], -1)
         length = np.linalg.norm(out, axis=1, keepdims=True)
         return out / np.where(length > 0, length, 1.0)
 

@@ -61,7 +61,7 @@ def test_round_parts_leave_turns_open_and_a_flat_patch_shifts_too() -> None:
 @pytest.mark.slow
 def test_what_is_not_the_part_does_not_fit() -> None:
     other = blob(20)
-    assert not place_on_part(mesh_of(trimesh.creation.box((60, 40, 25))), other.mapped(Similarity.scaling(30))).fits
+    assert not place_on_part(mesh_of(trimesh.creation.box((60, 40, 25))), other.mapped(Similarity.scaling(30.0))).fits
 
 
 def test_facets_of_a_cylinder_depart_by_what_their_number_says() -> None:
