@@ -497,18 +497,14 @@ def _deviations_file(mesh: "Mesh", found: "Inspection", name: str, unit: str) ->
 
 
 def _next_capture(evaluation: "Evaluation", inputs: "EvaluationInputs") -> "NextView | None":
-    from sl_nerfstudio.evaluation.completeness import CaptureView, next_view
-    from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+    from sl_nerfstudio.evaluation.completeness import next_view
+    from sl_nerfstudio.evaluation.mesh_index import IndexedMesh, capture_views
 
     found = evaluation.completeness
     if found is None:
         return None
-    poses = zip(inputs.poses.T_world_camera, inputs.poses.T_world_projector, strict=True)
-    frames = [
-        CaptureView(frame.camera, T_c, inputs.scan.projector, T_p)
-        for frame, (T_c, T_p) in zip(inputs.scan.frames, poses, strict=True)
-    ]
-    return next_view(IndexedMesh(inputs.mesh), found.openings, frames, found.noise_px)
+    views = capture_views(inputs.scan, inputs.poses)
+    return next_view(IndexedMesh(inputs.mesh), found.openings, views, found.noise_px)
 
 
 def _pairs(config: EvalConfig) -> "list[PointPair]":

@@ -16,7 +16,7 @@ from scipy.ndimage import binary_opening, label, map_coordinates
 
 from sl_nerfstudio.console import track
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.geometry.lie import DevicePoses, inverse, transform
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
 from sl_nerfstudio.geometry.triangulation import epipolar_residual, pixel_rays, triangulate
@@ -92,8 +92,12 @@ def frame_pixels(
     origin, direction = (x.numpy() for x in pixel_rays(camera, T_c, uv))
     hits = surface.cast(origin, direction)
     p_world = origin + hits.distance[:, None] * direction
-    predicted, reached = _predict(p_world, hits.hit, surface, scan.projector, projector, T_p)
-    predicted[~hits.hit] = np.nan
+    p_projector = transform(inverse(T_p), torch.as_tensor(np.nan_to_num(p_world)))
+    uv_projector, in_front = (x.numpy() for x in project(projector, p_projector))
+    predicted = np.where((hits.hit & in_front)[:, None], uv_projector, np.nan)
+    reached = ((predicted >= 0) & (predicted < (scan.projector.w, scan.projector.h))).all(1)
+    candidates = np.flatnonzero(reached)
+    reached[candidates] = ~surface.occluded(p_world[candidates], T_world_projector[:3, 3])
     rendered = np.where(reached, look_up(pattern, predicted), np.nan)
     measured = triangulate(camera, T_c, uv, projector, T_p, torch.nan_to_num(decoded_uv)).depth_camera.numpy()
 
@@ -122,25 +126,6 @@ def frame_pixels(
     )
 
 
-def _predict(
-    p_world: Float[ndarray, "n 3"],
-    hit: Bool[ndarray, "n"],
-    surface: IndexedMesh,
-    device: Device,
-    projector: Intrinsics,
-    T_world_projector: torch.Tensor,
-) -> tuple[Float[ndarray, "n 2"], Bool[ndarray, "n"]]:
-    """Pattern coordinates of surface points, and whether the projector really lights them."""
-    p_device = transform(inverse(T_world_projector), torch.as_tensor(np.nan_to_num(p_world)))
-    uv, in_front = project(projector, p_device)
-    uv = uv.numpy()
-    x, y = uv.T
-    reached = hit & in_front.numpy() & (x >= 0) & (x < device.w) & (y >= 0) & (y < device.h)
-    candidates = np.flatnonzero(reached)
-    reached[candidates] = ~surface.occluded(p_world[candidates], T_world_projector[:3, 3].numpy())
-    return np.where(in_front.numpy()[:, None], uv, np.nan), reached
-
-
 def look_up(image: Float[ndarray, "h w"], uv: Float[ndarray, "n 2"]) -> Float[ndarray, "n"]:
     """Bilinear value of an image at pixels `uv` (centre of the first pixel: 0.5); NaN for NaN."""
     out = np.full(len(uv), np.nan)
@@ -159,28 +144,21 @@ _JUMP = 2.5  # usual steps between neighbouring pixels, beyond which coordinates
 _LARGE_PATCH = 0.03  # of the decoded pixels: larger patches are no wrong decodings but surface that is missing
 
 
-@dataclass(frozen=True)
-class Holes:
-    """Missing surface in one frame, as shares of its decoded pixels."""
-
-    missing: float  # all of it
-    largest: float  # the largest connected area; gaps along rims do not count
-
-
-def find_holes(pixels: FramePixels, mesh_size: float) -> Holes:
+def find_holes(pixels: FramePixels, mesh_size: float) -> tuple[float, float]:
     """Decoded pixels whose ray misses the mesh, or passes far behind the triangulated point before it hits.
 
-    `mesh_size` is the diagonal of the mesh's box, in its unit. Patches of coordinates that are not continuous with what
-    surrounds them are wrong decodings, unless they are large.
+    As shares of all decoded ones: first all of them, then the largest connected area; gaps along rims do not count for
+    that. `mesh_size` is the diagonal of the mesh's box, in its unit. Patches of coordinates that are not continuous
+    with what surrounds them are wrong decodings, unless they are large.
     """
     trusted = pixels.decoded & (np.abs(pixels.epipolar) < _SIGMAS * pixels.noise_px)
     count = int(trusted.sum())
     if count == 0:
-        return Holes(0.0, 0.0)
+        return 0.0, 0.0
     through = (pixels.behind > _LEAST_DEPTH * mesh_size) & (pixels.coordinate > pixels.tolerance_px)
     missing = _as_image(pixels, trusted & (~pixels.hit | through), False)
     missing &= ~_wrong_patches(pixels, missing, count)
-    return Holes(float(missing.sum() / count), _largest_area(missing, count) / count)
+    return float(missing.sum() / count), _largest_area(missing, count) / count
 
 
 def _as_image(pixels: FramePixels, values: ndarray, nothing: float | bool) -> ndarray:
@@ -257,12 +235,12 @@ class CaptureAgreement:
     frames: tuple[FrameAgreement, ...]
 
 
-def frame_agreement(name: str, masked: int, pixels: FramePixels, holes: Holes) -> FrameAgreement:
-    """Summary of one frame's pixels, and of what is missing there."""
-    both = pixels.lit & np.isfinite(pixels.rendered)
+def frame_agreement(name: str, pixels: FramePixels, mesh_size: float) -> FrameAgreement:
+    """Summary of one frame's pixels, and of what is missing there; `mesh_size` as for `find_holes`."""
+    both, holes = pixels.lit & np.isfinite(pixels.rendered), find_holes(pixels, mesh_size)
     return FrameAgreement(
         name=name,
-        pixels=masked,
+        pixels=len(pixels.row) * pixels.stride**2,
         hit_share=_mean(pixels.hit),
         lit_share=_mean(pixels.lit),
         decoded_share=_mean(pixels.decoded),
@@ -274,8 +252,8 @@ def frame_agreement(name: str, masked: int, pixels: FramePixels, holes: Holes) -
         ray_angle_deg=_median(pixels.ray_angle_deg),
         covered_share=_mean(pixels.hit[pixels.decoded]),
         agreeing_share=_mean(pixels.coordinate[pixels.decoded & pixels.hit] < pixels.tolerance_px),
-        hole_share=holes.missing,
-        largest_hole=holes.largest,
+        hole_share=holes[0],
+        largest_hole=holes[1],
     )
 
 
@@ -293,8 +271,7 @@ def compare_captures(
 
     def compare(frame: Frame, *poses: Float[ndarray, "4 4"]) -> tuple[Frame, FrameAgreement, FramePixels]:
         pixels = frame_pixels(surface, frame, scan, pattern, *poses, max_pixels=most)
-        masked, holes = len(pixels.row) * pixels.stride**2, find_holes(pixels, surface.diagonal)
-        return frame, frame_agreement(frame.name, masked, pixels, holes), pixels
+        return frame, frame_agreement(frame.name, pixels, surface.diagonal), pixels
 
     every = zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
     tasks = [partial(compare, *one) for one in every]

@@ -2,15 +2,15 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 
 from sl_nerfstudio.console import track
 from sl_nerfstudio.evaluation.agreement import CaptureAgreement
-from sl_nerfstudio.evaluation.mesh_index import IndexedMesh, faces_and_falls_inside
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.evaluation.mesh_index import CaptureView, IndexedMesh, faces_and_falls_inside
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, component_labels
 from sl_nerfstudio.geometry.triangulation import world_pixels
@@ -116,14 +116,9 @@ def assess_completeness(surface: IndexedMesh, agreement: CaptureAgreement) -> Co
     """What the surface has of what was decoded, and where it ends."""
     decoded = np.array([frame.pixels * frame.decoded_share for frame in agreement.frames])
     missing = float((decoded * [frame.hole_share for frame in agreement.frames]).sum())
-    openings = find_openings(surface.mesh)
+    observed = 1 - missing / decoded.sum() if decoded.sum() else float("nan")
     noise = max(MAD_TO_SIGMA * float(np.nan_to_num(agreement.epipolar_px_median)), _LEAST_NOISE_PX)
-    return Completeness(
-        observed=1 - missing / decoded.sum() if decoded.sum() else float("nan"),
-        surface_area=surface.area,
-        openings=openings,
-        noise_px=noise,
-    )
+    return Completeness(observed, surface.area, find_openings(surface.mesh), noise)
 
 
 # How well each place of a surface is known from the frames that see it, and what one more frame would add.
@@ -137,16 +132,6 @@ _SEED = 0
 
 
 @dataclass(frozen=True)
-class CaptureView:
-    """A camera with its projector, anywhere."""
-
-    camera: Device
-    T_world_camera: Float[ndarray, "4 4"]
-    projector: Device
-    T_world_projector: Float[ndarray, "4 4"]
-
-
-@dataclass(frozen=True)
 class Places:
     """Points spread evenly over a surface and over what closes its openings."""
 
@@ -157,20 +142,9 @@ class Places:
     opening: Int[ndarray, "n"]  # number of the opening, -1 on the surface
 
 
-class Occluders:
+def occluders(surface: IndexedMesh, openings: Openings) -> list[IndexedMesh]:
     """The surface and what closes its openings: whoever looks through an opening sees no inner side."""
-
-    def __init__(self, surface: IndexedMesh, openings: Openings) -> None:
-        self._meshes = [surface]
-        if len(openings.fan):
-            self._meshes.append(IndexedMesh(openings.closing_mesh()))
-
-    def hides(self, points: Float[ndarray, "n 3"], eye: Float[ndarray, "3"]) -> Bool[ndarray, "n"]:
-        """Whether something is between each point and the eye."""
-        hidden = np.zeros(len(points), bool)
-        for mesh in self._meshes:
-            hidden |= mesh.occluded(points, eye)
-        return hidden
+    return [surface, IndexedMesh(openings.closing_mesh())] if len(openings.fan) else [surface]
 
 
 def places(surface: IndexedMesh, openings: Openings, count: int) -> Places:
@@ -197,26 +171,25 @@ def places(surface: IndexedMesh, openings: Openings, count: int) -> Places:
     )
 
 
-def information(at: Places, occluders: Occluders, view: CaptureView, noise_px: float) -> Float[ndarray, "n"]:
+def information(at: Places, hiding: Sequence[IndexedMesh], view: CaptureView, noise_px: float) -> Float[ndarray, "n"]:
     """What a view adds to the knowledge of each place along its normal, 1 / length^2; 0 where it does not see it."""
     index = np.arange(len(at.points))
-    for device, T in ((view.camera, view.T_world_camera), (view.projector, view.T_world_projector)):
+    for device, T in view.devices:
         inside = faces_and_falls_inside(at.points[index], at.normals[index], device, T)
         index = index[inside & (_cosine(at.points[index], at.normals[index], T) > _LEAST_COSINE)]
-    for T in (view.T_world_camera, view.T_world_projector):
-        index = index[~occluders.hides(at.points[index], T[:3, 3])]
+    for (_, T), mesh in product(view.devices, hiding):
+        index = index[~mesh.occluded(at.points[index], T[:3, 3])]
     out = np.zeros(len(at.points))
     cosine = _cosine(at.points[index], at.normals[index], view.T_world_camera)
     out[index] = cosine * (_pattern_px_per_length(at.points[index], view) / noise_px) ** 2
     return out
 
 
-def known(at: Places, occluders: Occluders, views: Sequence[CaptureView], noise_px: float) -> Float[ndarray, "n"]:
+def known(
+    at: Places, hiding: Sequence[IndexedMesh], views: Sequence[CaptureView], noise_px: float
+) -> Float[ndarray, "n"]:
     """Information about each place from all views and from the size of what is not seen."""
-    total = 1 / at.doubt**2
-    for view in views:
-        total = total + information(at, occluders, view, noise_px)
-    return total
+    return sum((information(at, hiding, view, noise_px) for view in views), start=1 / at.doubt**2)
 
 
 def _pattern_px_per_length(points: Float[ndarray, "n 3"], view: CaptureView) -> Float[ndarray, "n"]:
@@ -264,15 +237,13 @@ def next_view(
     The projector is held as in the frame with the usual distance from the camera, or where it stands, if it stands
     still. `noise_px` is the decoding's, in pattern pixels. Nothing is known here about what is in a tripod's way.
     """
-    at, occluders = places(surface, openings, _PLACES), Occluders(surface, openings)
-    poses = DevicePoses(
-        *(np.stack(T) for T in zip(*((f.T_world_camera, f.T_world_projector) for f in frames), strict=True))
-    )
-    before = known(at, occluders, frames, noise_px)
+    at, hiding = places(surface, openings, _PLACES), occluders(surface, openings)
+    poses = DevicePoses(np.stack([f.T_world_camera for f in frames]), np.stack([f.T_world_projector for f in frames]))
+    before = known(at, hiding, frames, noise_px)
     doubt = at.area / before
     best, most = None, 0.0
     for view in track(list(_candidates(surface, openings, frames, poses)), "what to capture next"):
-        added = information(at, occluders, view, noise_px)
+        added = information(at, hiding, view, noise_px)
         removed = float((doubt - at.area / (before + added)).sum())
         if removed > most:
             best, most = (view, added), removed

@@ -13,12 +13,7 @@ from scipy.spatial import KDTree
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.errors import UserError, first_line
-from sl_nerfstudio.evaluation.agreement import (
-    CaptureAgreement,
-    FrameAgreement,
-    FramePixels,
-    compare_captures,
-)
+from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement, FramePixels, compare_captures
 from sl_nerfstudio.evaluation.completeness import Completeness, assess_completeness
 from sl_nerfstudio.evaluation.mesh_faults import MeshFault, find_mesh_faults, missed_axes
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
@@ -468,8 +463,8 @@ def _missed(surface: IndexedMesh, scan: Scan, poses: DevicePoses) -> str:
 
 _OFF_SURFACE = 0.02  # of the mesh's diagonal: a point that is farther away was not meant to be on this mesh
 _TYPICAL, _LONG = 400, 0.3  # how many distances say what is typical, and the shortest one, of the mesh's diagonal
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_POINT = rf"{_NUMBER},{_NUMBER},{_NUMBER}"
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+POINT = rf"{NUMBER},{NUMBER},{NUMBER}"
 
 
 @dataclass(frozen=True)
@@ -498,7 +493,7 @@ class Length:
 def parse_pair(text: str, where: str) -> PointPair:
     """A pair from "x,y,z x,y,z", with "name:" before it if wanted. Raises UserError; `where` is the flag or line."""
     name, colon, rest = text.rpartition(":")
-    found = re.fullmatch(rf"\s*({_POINT})\s+({_POINT})\s*", rest)
+    found = re.fullmatch(rf"\s*({POINT})\s+({POINT})\s*", rest)
     if found is None or (colon and not name.strip()):
         raise UserError(
             f"{where}: {text.strip()!r:.100} is not two points\n"
@@ -518,12 +513,10 @@ def read_pairs(path: Path) -> list[PointPair]:
             f"--distances {path}: cannot be read ({first_line(error)})\n"
             "    remedy: give a text file with a line such as `handle: 12.5,-3,40 10,2,38` for each distance"
         ) from error
-    kept = [
-        (number, line) for number, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")
-    ]
+    kept = {number: line for number, line in enumerate(lines, 1) if line.strip() and line.lstrip()[0] != "#"}
     if not kept:
         raise UserError(f"--distances {path}: holds no distances\n    remedy: give a line `name: x,y,z x,y,z` for each")
-    return [parse_pair(line, f"{path}, line {number}") for number, line in kept]
+    return [parse_pair(line, f"{path}, line {number}") for number, line in kept.items()]
 
 
 def measure_lengths(
@@ -557,19 +550,10 @@ def measure_lengths(
     if quality is not None and joint is not None:
         found = length_sigma(mesh, quality.sigma_independent, vertices, scan, poses, joint)
         shared, independent = found.shared, found.independent
-    views = None if quality is None else quality.views[vertices]
+    views = [None if quality is None else (int(quality.views[a]), int(quality.views[b])) for a, b in vertices]
     return [
-        Length(
-            pair.name,
-            _triple(ends[k, 0]),
-            _triple(ends[k, 1]),
-            float(lengths[k]),
-            _known(float(np.hypot(shared[k], independent[k]))),
-            _known(float(shared[k])),
-            _known(float(independent[k])),
-            None if views is None else (int(views[k, 0]), int(views[k, 1])),
-        )
-        for k, pair in enumerate(pairs)
+        Length(pair.name, _triple(p), _triple(q), float(length), _known(np.hypot(a, b)), _known(a), _known(b), seen)
+        for pair, (p, q), length, a, b, seen in zip(pairs, ends, lengths, shared, independent, views, strict=True)
     ]
 
 
@@ -587,15 +571,15 @@ def typical_sigma(
     if not long.any():
         return None
     found = length_sigma(mesh, quality.sigma_independent, ends[long], scan, poses, joint)
-    return _known(float(np.nanmedian(np.hypot(found.shared, found.independent) / length[long])))
+    return _known(np.nanmedian(np.hypot(found.shared, found.independent) / length[long]))
 
 
 def _triple(p: Float[ndarray, "3"]) -> tuple[float, float, float]:
     return float(p[0]), float(p[1]), float(p[2])
 
 
-def _known(value: float) -> float | None:
-    return value if np.isfinite(value) else None
+def _known(value: float | np.floating) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def _off_surface(pair: PointPair, point: Float[ndarray, "3"], away: float, surface: IndexedMesh, units: str) -> str:

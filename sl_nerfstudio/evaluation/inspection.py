@@ -84,7 +84,8 @@ def inspect(
     indexed = IndexedMesh(part)
     deviation = indexed.signed_distance(S_part_mesh.points(mesh.vertices))
     sigma = None if quality is None else quality.sigma * S_part_mesh.scale
-    area = _vertex_areas(mesh) * S_part_mesh.scale**2
+    thirds = np.repeat(mesh.face_areas() / 3, 3)  # of the triangles around each vertex
+    area = np.bincount(mesh.faces.ravel(), thirds, len(mesh.vertices)) * S_part_mesh.scale**2
     measured = area > 0 if sigma is None else np.isfinite(sigma) & (area > 0)
     if not measured.any():
         sigma, measured = None, area > 0
@@ -119,11 +120,6 @@ def inspect(
     )
 
 
-def _vertex_areas(mesh: Mesh) -> Float64[ndarray, "v"]:
-    """A third of the area of the triangles around each vertex."""
-    return np.bincount(mesh.faces.ravel(), np.repeat(mesh.face_areas() / 3, 3), len(mesh.vertices))
-
-
 def _patches(
     mesh: Mesh,
     deviation: Float64[ndarray, "v"],
@@ -143,15 +139,9 @@ def _patches(
             d, a = deviation[corners], area[corners]
             peak = corners[int(np.abs(d).argmax())]
             x, y, z = S_part_mesh.points(mesh.vertices[peak]).tolist()
-            found.append(
-                Patch(
-                    (x, y, z),
-                    float(a.sum()),
-                    float(a @ d / a.sum()),
-                    side * float(np.percentile(np.abs(d), _HIGHEST)),
-                    None if sigma is None else float(np.median(sigma[corners])),
-                )
-            )
+            height = side * float(np.percentile(np.abs(d), _HIGHEST))
+            usual = None if sigma is None else float(np.median(sigma[corners]))
+            found.append(Patch((x, y, z), float(a.sum()), float(a @ d / a.sum()), height, usual))
     return tuple(sorted(found, key=lambda patch: -patch.area)[:_MOST_PATCHES])
 
 

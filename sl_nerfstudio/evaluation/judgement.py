@@ -4,6 +4,7 @@ import math
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
+from functools import partial
 from typing import Any, Literal
 
 from sl_nerfstudio.console import figure, unit_word
@@ -12,7 +13,7 @@ from sl_nerfstudio.evaluation.completeness import Completeness, NextView
 from sl_nerfstudio.evaluation.evaluate import Evaluation, Length, SurfaceScore
 from sl_nerfstudio.evaluation.inspection import Inspection
 from sl_nerfstudio.evaluation.part_alignment import PartAlignment
-from sl_nerfstudio.evaluation.reference import DeviceErrors, MeshReference, PoseErrors
+from sl_nerfstudio.evaluation.reference import MeshReference, PoseErrors
 from sl_nerfstudio.evaluation.shape_fits import FittedShape
 from sl_nerfstudio.review.verdict import (
     Band,
@@ -146,14 +147,13 @@ def coverage_figure(evaluation: Evaluation, commands: "FurtherCommands") -> Judg
     fit, found = evaluation.agreement, evaluation.completeness
     covered = min(fit.frames, key=lambda f: f.covered_share if math.isfinite(f.covered_share) else 1.0)
     hole = max(fit.frames, key=lambda f: f.largest_hole if math.isfinite(f.largest_hole) else 0.0)
+    observed, part = math.nan if found is None else found.observed, partial(judged, "", meaning="", advice="")
     parts = [
-        judged("", 100 * fit.hit_share, "{:.1f} % of the pixels with pattern", 97.0, 85.0, "≥ {} %", "", ""),
-        judged("", 100 * (math.nan if found is None else found.observed), "{:.1f} % of what the frames decoded",
-               99.0, 96.0, "≥ {} %", "", ""),
-        judged("", 100 * covered.covered_share, f"{{:.0f}} % of what {covered.name} decoded", 90.0, 75.0, "≥ {} %",
-               "", ""),
-        judged("", 100 * hole.largest_hole, f"largest gap {{:.1f}} % of {hole.name}", 0.5, 2.0, "≤ {} %", "", ""),
-    ]  # fmt: skip
+        part(100 * fit.hit_share, "{:.1f} % of the pixels with pattern", 97.0, 85.0, "≥ {} %"),
+        part(100 * observed, "{:.1f} % of what the frames decoded", 99.0, 96.0, "≥ {} %"),
+        part(100 * covered.covered_share, f"{{:.0f}} % of what {covered.name} decoded", 90.0, 75.0, "≥ {} %"),
+        part(100 * hole.largest_hole, f"largest gap {{:.1f}} % of {hole.name}", 0.5, 2.0, "≤ {} %"),
+    ]
     known = [part for part in parts if part.band != "unknown"]
     worst_part = max(known, key=lambda part: _ORDER[part.band], default=parts[0])
     return replace(
@@ -381,10 +381,8 @@ def judge(
     reasons += [Reason("poor", f"{name}: could not be placed", "again") for name in unplaced]
     reasons += departed_reasons([one for one in departed if one.name not in unplaced])
     verdict = worst(reasons).with_help(HELP)
-    return Judgement(
-        verdict, _sentence(verdict.band, evaluation), tuple(figures), _hints(evaluation, verdict.band, intrinsics),
-        capture_next(evaluation, capture),
-    )  # fmt: skip
+    sentence, hints = _sentence(verdict.band, evaluation), _hints(evaluation, verdict.band, intrinsics)
+    return Judgement(verdict, sentence, tuple(figures), hints, capture_next(evaluation, capture))
 
 
 def _accuracy(evaluation: Evaluation) -> JudgedFigure:
@@ -440,14 +438,11 @@ WORST_FRAME = (
 def judge_worst(figure: WorstFrameFigure, evaluation: Evaluation, commands: FurtherCommands) -> JudgedFigure:
     """Judge the frame in which a figure is worst, by name."""
     sign = 1 if figure.good < figure.acceptable else -1
-    frames = [f for f in evaluation.agreement.frames if math.isfinite(getattr(f, figure.key))]
-    worst_frame: FrameAgreement | None = max(frames, key=lambda f: sign * getattr(f, figure.key), default=None)
-    if worst_frame is None:
-        value, name = math.nan, ""
-    else:
-        value, name = getattr(worst_frame, figure.key), worst_frame.name
+    every = [(getattr(f, figure.key), f.name) for f in evaluation.agreement.frames]
+    known = [(value, name) for value, name in every if math.isfinite(value)]
+    value, name = max(known, key=lambda one: sign * one[0], default=(math.nan, ""))
     if figure.relative:
-        usual = sorted(getattr(f, figure.key) for f in frames)[len(frames) // 2] if frames else math.nan
+        usual = sorted(one for one, _ in known)[len(known) // 2] if known else math.nan
         value, form, limit = value / usual if usual > 0 else math.nan, "{:.1f} times the median", "{} times"
     else:
         value, form, limit = 100 * value, "{:.1f} %", "{} %"
@@ -528,36 +523,27 @@ def to_json(
     distances and shapes that were asked for. `inspection` has the deviations from a nominal part, `part` where the
     surface lies on it and what its shape leaves open.
     """
-    out: dict[str, Any] = {
+    reference, errors, initial = evaluation.reference, evaluation.pose_errors, evaluation.initial_pose_errors
+    found, cross = evaluation.completeness, evaluation.cross
+    blocks = {
         "format": 1,
         "verdict": verdict.band,
         "reasons": list(verdict.reasons),
         "units": evaluation.units,
+        "truth_units": None if reference is None and errors is None else evaluation.truth_units,
+        "reference": None if reference is None else reference.description,
+        **{name: _surface(score) for name, score in evaluation.surface.items()},
+        **({} if errors is None else _poses(errors)),
+        "initial": None if initial is None else _poses(initial),
+        "fit": asdict(evaluation.agreement),
+        "coverage": None if found is None else _coverage(found) | {"next_capture": _capture(capture)},
+        "cross_frame": None if cross is None else {k: v for k, v in asdict(cross).items() if k != "pairs"},
+        "lengths": [asdict(length) for length in lengths] or None,
+        "inspection": None if inspection is None else _inspection(inspection),
+        "part": None if placed is None else _placed(placed),
+        "fits": [asdict(fit) for fit in fits] or None,
     }
-    if evaluation.reference is not None or evaluation.pose_errors is not None:
-        out["truth_units"] = evaluation.truth_units
-    if evaluation.reference is not None:
-        out["reference"] = evaluation.reference.description
-    for name, score in evaluation.surface.items():
-        out[name] = _surface(score)
-    if evaluation.pose_errors is not None:
-        out |= _poses(evaluation.pose_errors)
-    if evaluation.initial_pose_errors is not None:
-        out["initial"] = _poses(evaluation.initial_pose_errors)
-    out["fit"] = asdict(evaluation.agreement)
-    if evaluation.completeness is not None:
-        out["coverage"] = _coverage(evaluation.completeness) | {"next_capture": _capture(capture)}
-    if evaluation.cross is not None:
-        out["cross_frame"] = {key: value for key, value in asdict(evaluation.cross).items() if key != "pairs"}
-    if lengths:
-        out["lengths"] = [asdict(length) for length in lengths]
-    if inspection is not None:
-        out["inspection"] = _inspection(inspection)
-    if placed is not None:
-        out["part"] = _placed(placed)
-    if fits:
-        out["fits"] = [asdict(fit) for fit in fits]
-    return _finite(out)
+    return _finite({name: block for name, block in blocks.items() if block is not None})
 
 
 def _inspection(found: Inspection) -> dict[str, Any]:
@@ -619,21 +605,17 @@ def _surface(score: SurfaceScore) -> dict[str, Any]:
 
 
 def _poses(errors: PoseErrors) -> dict[str, Any]:
-    return {
-        "camera": _device(errors.camera),
-        "projector": _device(errors.projector),
-        "relative": _device(errors.relative),
-        "scale_error": errors.scale_error,
+    devices = {"camera": errors.camera, "projector": errors.projector, "relative": errors.relative}
+    blocks: dict[str, Any] = {
+        name: {
+            "translation_rmse": one.translation_rmse,
+            "rotation_rmse_deg": one.rotation_rmse_deg,
+            "translation": one.translation.tolist(),
+            "rotation_deg": one.rotation_deg.tolist(),
+        }
+        for name, one in devices.items()
     }
-
-
-def _device(errors: DeviceErrors) -> dict[str, Any]:
-    return {
-        "translation_rmse": errors.translation_rmse,
-        "rotation_rmse_deg": errors.rotation_rmse_deg,
-        "translation": errors.translation.tolist(),
-        "rotation_deg": errors.rotation_deg.tolist(),
-    }
+    return {**blocks, "scale_error": errors.scale_error}
 
 
 def _finite(value: Any) -> Any:

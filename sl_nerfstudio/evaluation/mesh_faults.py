@@ -18,7 +18,8 @@ from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.lie import AXIS_TURNS, DevicePoses, axis_words
 from sl_nerfstudio.geometry.numerics import component_labels, evenly_spaced
-from sl_nerfstudio.geometry.triangulation import pixel_rays, triangulate
+from sl_nerfstudio.geometry.triangulation import pixel_rays
+from sl_nerfstudio.review.agreement import triangulate_some
 from sl_nerfstudio.review.verdict import Reason
 from sl_nerfstudio.scan import Scan
 
@@ -73,17 +74,11 @@ def missed_axes(surface: IndexedMesh, scan: Scan, poses: DevicePoses) -> str:
 
 def _measure(scan: Scan, poses: DevicePoses) -> _Measured:
     parts = [[np.zeros((0, 3))] for _ in range(3)]
-    projector = Intrinsics.of(scan.projector, torch.float64)
     for k in evenly_spaced(len(scan.frames), min(_FRAMES, len(scan.frames))).tolist():
-        frame = scan.frames[k]
-        coords = frame.read_coords()
-        usable = np.flatnonzero(np.isfinite(coords).all(-1) & frame.read_mask())
-        row, column = np.divmod(usable[evenly_spaced(len(usable), min(_PIXELS, len(usable)))], coords.shape[1])
-        uv = torch.from_numpy(np.stack([column, row], -1) + 0.5)
-        camera, T_c = Intrinsics.of(frame.camera, torch.float64), torch.from_numpy(poses.T_world_camera[k])
-        uv_projector = torch.from_numpy(coords[row, column].astype(np.float64))
-        found = triangulate(camera, T_c, uv, projector, torch.from_numpy(poses.T_world_projector[k]), uv_projector)
-        origin, direction = (x.numpy() for x in pixel_rays(camera, T_c, uv))
+        frame, T = scan.frames[k], (poses.T_world_camera[k], poses.T_world_projector[k])
+        uv, found = triangulate_some(frame.camera, scan.projector, *T, frame.read_masked_coords(), _PIXELS)
+        camera = Intrinsics.of(frame.camera, torch.float64)
+        origin, direction = (x.numpy() for x in pixel_rays(camera, torch.from_numpy(T[0]), uv))
         good = (np.isfinite(found.p_world.numpy()).all(1)) & (found.depth_camera.numpy() > 0)
         for part, values in zip(parts, (found.p_world.numpy(), origin, direction), strict=True):
             part.append(np.broadcast_to(values, (len(uv), 3))[good])

@@ -9,10 +9,12 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.triangulation import world_pixels
 from sl_nerfstudio.late_imports import open3d as o3d
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.parallel import compiled, results, split, threads
+from sl_nerfstudio.scan import Scan
 
 # Triangles in float64: nearest points, neighbours, and which of them are long and thin.
 
@@ -116,18 +118,16 @@ class IndexedMesh:
         self.centre = (self.lower + self.upper) / 2
         self.diagonal = float(np.linalg.norm(self.upper - self.lower))
         self._scale = 1 / max(self.diagonal, 1e-300)
-        self._scene = self._build(self.vertices, self.faces)
+        self._scene = o3d.t.geometry.RaycastingScene()
+        corners, faces = self._inside(self.vertices), self.faces.astype(np.uint32)
+        self._scene.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(faces))
+        self._scene.cast_rays(o3d.core.Tensor(np.zeros((1, 6), np.float32)))  # the index, before threads share it
 
     def _inside(self, p: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
         return ((p - self.centre) * self._scale).astype(np.float32)
 
-    def _build(self, vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"]) -> o3d.t.geometry.RaycastingScene:
-        scene = o3d.t.geometry.RaycastingScene()
-        scene.add_triangles(o3d.core.Tensor(self._inside(vertices)), o3d.core.Tensor(faces.astype(np.uint32)))
-        scene.cast_rays(o3d.core.Tensor(np.zeros((1, 6), np.float32)))  # builds the index, before threads share it
-        return scene
-
-    def _corners(self, face: Int[ndarray, "n"]) -> tuple[Float[ndarray, "n 3"], ...]:
+    def corners(self, face: Int[ndarray, "n"]) -> tuple[Float[ndarray, "n 3"], ...]:
+        """The three corners of some triangles."""
         return tuple(self.vertices[self.faces[face, k]] for k in range(3))
 
     @cached_property
@@ -143,13 +143,7 @@ class IndexedMesh:
     @cached_property
     def face_cross(self) -> Float[ndarray, "f 3"]:
         """Twice the area times the unit normal of each triangle."""
-        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
-        return np.cross(b - a, c - a)
-
-    @cached_property
-    def vertex_normals(self) -> Float[ndarray, "v 3"]:
-        """Unit normals of the vertices."""
-        return self.mesh.vertex_normals()
+        return self.mesh.face_cross()
 
     @cached_property
     def area(self) -> float:
@@ -167,7 +161,7 @@ class IndexedMesh:
         position = (np.arange(count) + rng.random(count)) / count * cumulated[-1]
         face = np.minimum(np.searchsorted(cumulated, position, side="right"), len(self.faces) - 1)
         root, s = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
-        a, b, c = (self.vertices[self.faces[face, k]] for k in range(3))
+        a, b, c = self.corners(face)
         points = (1 - root) * a + root * (1 - s) * b + root * s * c
         return points, self.face_cross[face] / np.maximum(doubled[face, None], 1e-300)
 
@@ -182,11 +176,11 @@ class IndexedMesh:
         face = answer["primitive_ids"].numpy().astype(np.int64)
         # Open3D's nearest point is good to 1e-7 of the size, except on long thin triangles (of a CAD cylinder), where
         # float32 can miss the right one. Therefore: the nearest of that triangle and its neighbours, in float64.
-        foot = nearest_on_triangle(points, *self._corners(face))
+        foot = nearest_on_triangle(points, *self.corners(face))
         best = np.linalg.norm(points - foot, axis=1)
         near_thin = np.flatnonzero(self._by_thin[face])
         for other in self._neighbours[face[near_thin]].T:
-            candidate = nearest_on_triangle(points[near_thin], *self._corners(other))
+            candidate = nearest_on_triangle(points[near_thin], *self.corners(other))
             distance = np.linalg.norm(points[near_thin] - candidate, axis=1)
             better = distance < best[near_thin]
             index = near_thin[better]
@@ -240,21 +234,39 @@ class IndexedMesh:
         return o3d.core.Tensor(np.concatenate([self._inside(origins), directions.astype(np.float32)], 1))
 
 
+@dataclass(frozen=True)
+class CaptureView:
+    """A camera with its projector, anywhere."""
+
+    camera: Device
+    T_world_camera: Float[ndarray, "4 4"]
+    projector: Device
+    T_world_projector: Float[ndarray, "4 4"]
+
+    @property
+    def devices(self) -> tuple[tuple[Device, Float[ndarray, "4 4"]], ...]:
+        """Both devices with their poses, the camera first."""
+        return (self.camera, self.T_world_camera), (self.projector, self.T_world_projector)
+
+
+def capture_views(scan: Scan, poses: DevicePoses) -> list[CaptureView]:
+    """The views of all frames of a scan."""
+    every = zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
+    return [CaptureView(frame.camera, T_c, scan.projector, T_p) for frame, T_c, T_p in every]
+
+
 def observable(
-    points: Float[ndarray, "m 3"],
-    normals: Float[ndarray, "m 3"],
-    surface: IndexedMesh,
-    frames: Iterable[tuple[Device, Float[ndarray, "4 4"], Device, Float[ndarray, "4 4"]]],
+    points: Float[ndarray, "m 3"], normals: Float[ndarray, "m 3"], surface: IndexedMesh, views: Iterable[CaptureView]
 ) -> Bool[ndarray, "m"]:
-    """Whether at least one frame's camera sees a point while that frame's projector lights it.
+    """Whether in at least one view the camera sees a point while the projector lights it.
 
     Seen and lit mean: the surface faces the device, the point projects into its image, and no other part of the
-    surface is in between. `frames` holds (camera, T_world_camera, projector, T_world_projector).
+    surface is in between.
     """
     seen = np.zeros(len(points), bool)
-    for camera, T_world_camera, projector, T_world_projector in frames:
+    for view in views:
         unseen = np.flatnonzero(~seen)
-        for device, T in ((camera, T_world_camera), (projector, T_world_projector)):
+        for device, T in view.devices:
             unseen = unseen[faces_and_falls_inside(points[unseen], normals[unseen], device, T)]
             unseen = unseen[~surface.occluded(points[unseen], T[:3, 3])]
         seen[unseen] = True

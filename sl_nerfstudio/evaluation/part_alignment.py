@@ -119,9 +119,8 @@ class _Points:
 
     def rms(self, S: Similarity) -> float:
         """RMS distance of the nearest 80 % of the points, in the part's unit."""
-        return float(
-            np.sqrt((np.sort(self.part.distance(S.points(self.points)))[: int(0.8 * len(self.points))] ** 2).mean())
-        )
+        distance = np.sort(self.part.distance(S.points(self.points)))
+        return float(np.sqrt((distance[: int(0.8 * len(distance))] ** 2).mean()))
 
     def followed(self, places: Sequence[Similarity], steps: int, with_scale: bool) -> list[Similarity]:
         """The places after some steps of ICP from each; a point counts if the part's nearest side faces its way."""
@@ -167,23 +166,17 @@ def place_on_part(result: Mesh, part: Mesh, with_scale: bool = False, seed: int 
     fits = _AS_GOOD * costs[0] + facet_sag(indexed) ** 2 + (_EXACT * indexed.diagonal) ** 2
     # The axes that the result has count before others that fit no better.
     own = every.followed([Similarity.identity()], 2 * _LAST_STEPS, with_scale)[0]
-    in_place = bool(every.costs([own])[0] <= fits and _small(own, every))
+    cost, moved = every.costs([own]), np.linalg.norm(own.points(every.points) - every.points, axis=1).max()
+    in_place = bool(cost[0] <= fits and moved < _SMALL * indexed.diagonal)
     if in_place:
-        places, costs = [own, *places], np.concatenate([every.costs([own]), costs])
+        places, costs = [own, *places], np.concatenate([cost, costs])
     motions = _open_motions(every, places[0], fits)
     places, costs = _distinct(places, costs, every, motions, len(places))
     equal = _completed([S for S, cost in zip(places, costs, strict=True) if cost <= fits], every, motions, fits)
     turns = [(S @ places[0].inverse()).R for S in equal[1:]]
     worse = [S for S, cost in zip(places[1:], costs[1:], strict=True) if cost > fits]
-    return PartAlignment(
-        places[0],
-        in_place,
-        every.rms(places[0]),
-        min(indexed.diagonal, places[0].scale * whole.diagonal),
-        motions,
-        tuple(turns),
-        every.rms(worse[0]) if worse else None,
-    )
+    size, next_rms = min(indexed.diagonal, places[0].scale * whole.diagonal), every.rms(worse[0]) if worse else None
+    return PartAlignment(places[0], in_place, every.rms(places[0]), size, motions, tuple(turns), next_rms)
 
 
 def _completed(equal: list[Similarity], points: _Points, motions: OpenMotions, fits: float) -> list[Similarity]:
@@ -198,12 +191,6 @@ def _completed(equal: list[Similarity], points: _Points, motions: OpenMotions, f
             break
         equal = more
     return equal
-
-
-def _small(S: Similarity, points: _Points) -> bool:
-    """Whether a result is where it belongs but for what ICP finds from there."""
-    moved = np.linalg.norm(S.points(points.points) - points.points, axis=1).max()
-    return bool(moved < _SMALL * points.part.diagonal)
 
 
 def _starts(points: _Points, with_scale: bool, seed: int) -> list[Similarity]:

@@ -9,7 +9,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.evaluation.mesh_index import Closest, IndexedMesh, observable
+from sl_nerfstudio.evaluation.mesh_index import Closest, IndexedMesh, capture_views, observable
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, log_so3
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Scan
@@ -19,6 +19,7 @@ from sl_nerfstudio.scan import Scan
 _MAX_LOG_SCALE = np.log(1.5)  # limit for ICP with scale, which could otherwise shrink the result onto a patch
 _TRUSTED = 0.7  # share of the points assumed to lie on the target
 _TRUSTED_SIGMA = 1.0364  # quantile of |x| at _TRUSTED, x standard normal
+_MOST_STEPS = 60
 _TUKEY = 4.685  # of the robust sigma: 95 % efficiency on normal residuals (Tukey's biweight)
 
 
@@ -54,13 +55,7 @@ def align_poses(
     return Similarity(scale, R, mean_t - scale * R @ mean_s)
 
 
-def icp(
-    points: Float[ndarray, "n 3"],
-    target: IndexedMesh,
-    start: Similarity,
-    with_scale: bool,
-    max_iterations: int = 60,
-) -> Alignment:
+def icp(points: Float[ndarray, "n 3"], target: IndexedMesh, start: Similarity, with_scale: bool) -> Alignment:
     """Robust point-to-plane ICP of `points` onto `target`, from `start`.
 
     Each round matches every point with the nearest point of the target's triangles and takes one
@@ -70,7 +65,7 @@ def icp(
     Directions that the data do not determine (the rotations of a sphere) stay at their start.
     """
     S = start
-    for _ in range(max_iterations):
+    for _ in range(_MOST_STEPS):
         moved = S.points(points)
         near = target.closest(moved)
         proposed = icp_step(moved, near, target, with_scale) @ S
@@ -84,26 +79,14 @@ def icp(
     return Alignment(S, float(np.sqrt((best**2).mean())))
 
 
-def icp_step(points: Float[ndarray, "n 3"], near: Closest, target: IndexedMesh, with_scale: bool) -> Similarity:
-    """One step of `icp`: the motion of points whose nearest points on the target are `near`."""
-    weights = _tukey(near.distance, floor=1e-9 * target.diagonal)
-    return _gauss_newton_step(points, near.point, near.normal, weights, with_scale)
+def icp_step(p: Float[ndarray, "n 3"], near: Closest, target: IndexedMesh, with_scale: bool) -> Similarity:
+    """One step of `icp`: the small similarity, about their centroid, of points with their nearest ones on the target.
 
-
-def _tukey(distance: Float[ndarray, "n"], floor: float) -> Float[ndarray, "n"]:
-    cut = max(_TUKEY * float(np.percentile(distance, 100 * _TRUSTED)) / _TRUSTED_SIGMA, floor)
-    return np.clip(1 - (distance / cut) ** 2, 0, None) ** 2
-
-
-def _gauss_newton_step(
-    p: Float[ndarray, "n 3"],
-    q: Float[ndarray, "n 3"],
-    normal: Float[ndarray, "n 3"],
-    weights: Float[ndarray, "n"],
-    with_scale: bool,
-) -> Similarity:
-    """The small similarity about the centroid of `p` that moves `p` closest to the planes through `q`."""
-    total = weights.sum()
+    It moves the points closest to the planes through those.
+    """
+    spread = _TUKEY * float(np.percentile(near.distance, 100 * _TRUSTED)) / _TRUSTED_SIGMA
+    weights = np.clip(1 - (near.distance / max(spread, 1e-9 * target.diagonal)) ** 2, 0, None) ** 2
+    normal, total = near.normal, weights.sum()
     if total <= 0:
         return Similarity.identity()
     centroid = weights @ p / total
@@ -114,7 +97,7 @@ def _gauss_newton_step(
     if with_scale:
         columns.append((local * normal).sum(1, keepdims=True))
     J = np.concatenate(columns, 1)
-    r = ((q - p) * normal).sum(1) / size
+    r = ((near.point - p) * normal).sum(1) / size
     H = J.T @ (weights[:, None] * J)
     x = np.linalg.lstsq(H, J.T @ (weights * r), rcond=1e-8)[0]
     R = _rotation(x[3:6])
@@ -162,7 +145,6 @@ class PoseErrors:
     projector: DeviceErrors
     relative: DeviceErrors  # projector relative to the camera of its frame; needs no alignment except for the scale
     scale_error: float  # estimated lengths are 1 + scale_error times the true ones
-    S_truth_estimate: Similarity
 
 
 def compare_poses(estimated: DevicePoses, true: DevicePoses) -> PoseErrors:
@@ -180,7 +162,6 @@ def compare_poses(estimated: DevicePoses, true: DevicePoses) -> PoseErrors:
         projector=_device_errors(aligned.T_world_projector, true.T_world_projector),
         relative=_device_errors(relative, true.T_camera_projector),
         scale_error=1 / S.scale - 1,
-        S_truth_estimate=S,
     )
 
 
@@ -278,14 +259,11 @@ def mesh_reference(mesh: Mesh, scan: Scan, poses: DevicePoses, samples: int = 10
     """
     surface = IndexedMesh(mesh)
     points, normals = surface.sample(samples, seed + 1)
-    frames = [
-        (frame.camera, T_c, scan.projector, T_p)
-        for frame, T_c, T_p in zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True)
-    ]
-    seen = observable(points, normals, surface, frames)
+    views = capture_views(scan, poses)
+    seen = observable(points, normals, surface, views)
     # Almost nothing of a closed mesh is visible if it is inside out; with flipped normals, much more is.
     few = seen.mean() < 0.05
-    if not seen.any() or (few and observable(points, -normals, surface, frames).mean() > 4 * seen.mean()):
+    if not seen.any() or (few and observable(points, -normals, surface, views).mean() > 4 * seen.mean()):
         raise UserError(
             "no part of the reference mesh is both seen by a camera and lit by its projector\n"
             f"    cause:  it is inside out, in another unit than the scan ({scan.units}), or in other axes\n"

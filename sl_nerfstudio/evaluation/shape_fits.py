@@ -18,6 +18,7 @@ from scipy.spatial import KDTree
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.evaluation.evaluate import NUMBER, POINT
 from sl_nerfstudio.geometry.least_squares import NormalEquations, minimise
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
@@ -34,8 +35,7 @@ _REWEIGHTED = 6  # times
 _TUKEY = 4.685  # of the robust sigma
 _EXACT = 1e-9  # of the region: smaller distances are rounding
 _LARGEST_RADIUS = 50.0  # of the region's radius: what is flatter has no measurable radius
-_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
-_REGION = re.compile(rf"\s*(\w+)\s+({_NUMBER},{_NUMBER},{_NUMBER})\s+({_NUMBER})\s*")
+_REGION = re.compile(rf"\s*(\w+)\s+({POINT})\s+({NUMBER})\s*")
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,7 @@ def fit_shape(
     errors of poses and intrinsics. Raises UserError if the region holds too little surface, or has no such radius.
     """
     used = np.unique(mesh.faces)
-    chosen = used[KDTree(mesh.vertices[used]).query_ball_point(region.point, region.radius)]
-    chosen = np.sort(chosen)
+    chosen = np.sort(used[KDTree(mesh.vertices[used]).query_ball_point(region.point, region.radius)])
     if len(chosen) < _FEWEST:
         low, high = (",".join(f"{v:.4g}" for v in corner) for corner in mesh.bounds())
         raise UserError(

@@ -299,7 +299,13 @@ def extract_mesh(
     """
     if resolution < 2:
         raise UserError(f"--resolution {resolution}: a mesh needs at least 2 cells along an axis; 256 or 512 is usual")
-    grid = _grid(sdf, resolution, lower, upper, torch.device(device))
+    sides = [u - low for low, u in zip(lower, upper, strict=True)]
+    if min(sides) <= 0:
+        raise ValueError(f"the box is empty: lower {lower}, upper {upper}")
+    cell = max(sides) / resolution
+    nx, ny, nz = (LEAF * math.ceil(side / cell / LEAF - 1e-9) for side in sides)
+    step = (sides[0] / nx, sides[1] / ny, sides[2] / nz)
+    grid = SparseGrid(sdf, lower, step, (nx, ny, nz), torch.device(device))
     leaves = evaluate_leaves(grid, find_leaves(grid, safety))
     corner, case = _surface_cells(leaves)
     if len(case) == 0:
@@ -307,22 +313,6 @@ def extract_mesh(
     edges, faces = _triangles(corner, case)
     vertices = _vertices(grid, leaves, edges, polish)
     return Mesh(vertices.cpu().numpy(), faces.cpu().numpy())
-
-
-def _grid(
-    sdf: Field,
-    resolution: int,
-    lower: tuple[float, float, float],
-    upper: tuple[float, float, float],
-    device: torch.device,
-) -> SparseGrid:
-    sides = [u - low for low, u in zip(lower, upper, strict=True)]
-    if min(sides) <= 0:
-        raise ValueError(f"the box is empty: lower {lower}, upper {upper}")
-    cell = max(sides) / resolution
-    cells = [LEAF * math.ceil(side / cell / LEAF - 1e-9) for side in sides]
-    step = [side / n for side, n in zip(sides, cells, strict=True)]
-    return SparseGrid(sdf, lower, (step[0], step[1], step[2]), (cells[0], cells[1], cells[2]), device)
 
 
 def _no_surface(grid: SparseGrid) -> str:

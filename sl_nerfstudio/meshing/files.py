@@ -44,7 +44,7 @@ def file_from_world(suffix: str, units: str) -> Similarity:
 
 # PLY files with properties of vertices: what a mesh is worth at each of its vertices.
 
-_FACES = "element face {}\nproperty list uchar int vertex_indices"
+_COLOUR = ("red", "green", "blue")
 _TYPES = {"double": "<f8", "float": "<f4", "int": "<i4", "ushort": "<u2", "uchar": "u1"}  # not all programs read ushort
 
 
@@ -54,18 +54,7 @@ def encode_ply(mesh: Mesh, properties: VertexProperties | None = None, unit: str
     `unit` is said in a comment of the header.
     """
     columns = _columns(mesh.vertices, mesh.vertex_normals(), properties)
-    return _encode(columns, _unit_note(unit), [_FACES.format(len(mesh.faces))]) + _encode_faces(mesh)
-
-
-def encode_points(
-    points: Float64[ndarray, "n 3"], normals: Float64[ndarray, "n 3"], properties: VertexProperties, unit: str
-) -> bytes:
-    """A binary PLY of points without triangles, with the same properties."""
-    return _encode(_columns(points, normals, properties), _unit_note(unit), [])
-
-
-def _unit_note(unit: str) -> list[str]:
-    return [f"lengths in {unit}"] if unit else []
+    return _encode(columns, [f"lengths in {unit}"] if unit else [], mesh)
 
 
 DEVIATIONS = "deviations from"
@@ -81,15 +70,8 @@ def encode_deviations(
 ) -> bytes:
     """A binary PLY with `deviation` and `sigma` of every vertex; `notes` are comments: unit, axes, legend."""
     columns = _columns(mesh.vertices, mesh.vertex_normals(), None)
-    columns |= {name: ("uchar", colour[:, k]) for k, name in enumerate(("red", "green", "blue"))}
-    columns |= {"deviation": ("float", deviation), "sigma": ("float", sigma)}
-    return _encode(columns, notes, [_FACES.format(len(mesh.faces))]) + _encode_faces(mesh)
-
-
-def _encode_faces(mesh: Mesh) -> bytes:
-    faces = np.empty(len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
-    faces["count"], faces["corner"] = 3, mesh.faces
-    return faces.tobytes()
+    columns |= {name: ("uchar", colour[:, k]) for k, name in enumerate(_COLOUR)}
+    return _encode(columns | {"deviation": ("float", deviation), "sigma": ("float", sigma)}, notes, mesh)
 
 
 def _columns(
@@ -100,7 +82,7 @@ def _columns(
     if properties is None:
         return columns
     if properties.colour is not None:
-        columns |= {name: ("uchar", properties.colour[:, k]) for k, name in enumerate(("red", "green", "blue"))}
+        columns |= {name: ("uchar", properties.colour[:, k]) for k, name in enumerate(_COLOUR)}
     quality = properties.quality
     return columns | {
         "sigma": ("float", quality.sigma),
@@ -112,8 +94,11 @@ def _columns(
     }
 
 
-def _encode(columns: dict[str, tuple[str, ndarray]], notes: Sequence[str], element: list[str]) -> bytes:
-    """Header and vertices; `notes` are comments, `element` the header's lines of what follows the vertices."""
+def _encode(columns: dict[str, tuple[str, ndarray]], notes: Sequence[str], mesh: Mesh | None = None) -> bytes:
+    """Header, vertices, and the triangles of a mesh; `notes` are comments."""
+    faces = np.empty(0 if mesh is None else len(mesh.faces), dtype=[("count", "u1"), ("corner", "<i4", (3,))])
+    if mesh is not None:
+        faces["count"], faces["corner"] = 3, mesh.faces
     rows = np.empty(len(columns["x"][1]), dtype=[(name, _TYPES[kind]) for name, (kind, _) in columns.items()])
     for name, (_, values) in columns.items():
         rows[name] = values
@@ -123,10 +108,10 @@ def _encode(columns: dict[str, tuple[str, ndarray]], notes: Sequence[str], eleme
         *(f"comment {note}" for note in notes),
         f"element vertex {len(rows)}",
         *(f"property {kind} {name}" for name, (kind, _) in columns.items()),
-        *element,
+        *([] if mesh is None else [f"element face {len(faces)}", "property list uchar int vertex_indices"]),
         "end_header\n",
     ]
-    return "\n".join(header).encode("ascii") + rows.tobytes()
+    return "\n".join(header).encode("ascii") + rows.tobytes() + faces.tobytes()
 
 
 def read_quality(path: Path | str) -> VertexQuality | None:
@@ -138,21 +123,16 @@ def read_quality(path: Path | str) -> VertexQuality | None:
     def column(name: str) -> Float64[ndarray, "v"]:
         return rows[name].astype(np.float64) if name in rows.dtype.names else np.full(len(rows), np.nan)
 
-    return VertexQuality(
-        column("sigma"),
-        column("sigma_independent"),
-        rows["views"].astype(np.int64),
-        column("residual"),
-        column("ray_angle"),
-    )
+    sigma, independent, residual, angle = map(column, ("sigma", "sigma_independent", "residual", "ray_angle"))
+    return VertexQuality(sigma, independent, rows["views"].astype(np.int64), residual, angle)
 
 
 def read_colour(path: Path | str) -> UInt8[ndarray, "v 3"] | None:
     """The colours of the vertices of a PLY file, as `encode_ply` writes them; None for any other file."""
-    rows, names = _read_rows(path), ("red", "green", "blue")
-    if rows is None or any(rows.dtype.fields.get(name, (None,))[0] != np.uint8 for name in names):
+    rows = _read_rows(path)
+    if rows is None or any(rows.dtype.fields.get(name, (None,))[0] != np.uint8 for name in _COLOUR):
         return None
-    return np.stack([rows[name] for name in names], 1)
+    return np.stack([rows[name] for name in _COLOUR], 1)
 
 
 def _read_rows(path: Path | str) -> ndarray | None:
@@ -186,20 +166,16 @@ def encode_obj(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, charts: Charts 
 
     `library` is the name of the material file. Positions have 8 decimals. Texture coordinates are counted upwards.
     """
-    colour = colour if charts is None else None
-    columns = [mesh.vertices] if colour is None else [mesh.vertices, colour / 255.0]
-    line = "v {:.8f} {:.8f} {:.8f}" + ("" if colour is None else " {:.4f} {:.4f} {:.4f}")
-    rows = np.concatenate(columns, 1)
+    rows, line = mesh.vertices, "v {:.8f} {:.8f} {:.8f}"
+    if colour is not None and charts is None:
+        rows, line = np.concatenate([rows, colour / 255.0], 1), line + " {:.4f} {:.4f} {:.4f}"
     text = [f"mtllib {library}", *map(line.format, *rows.T.tolist())]
     text += map("vn {:.6f} {:.6f} {:.6f}".format, *mesh.vertex_normals().T.tolist())
+    corners, line = mesh.faces, "f {0}//{0} {1}//{1} {2}//{2}"
     if charts is not None:
         text += map("vt {:.7f} {:.7f}".format, charts.uv[:, 0].tolist(), (1.0 - charts.uv[:, 1]).tolist())
-    text.append(f"usemtl {MATERIAL}")
-    if charts is None:
-        text += map("f {0}//{0} {1}//{1} {2}//{2}".format, *(mesh.faces + 1).T.tolist())
-    else:
-        columns = np.concatenate([mesh.faces, charts.corners], 1) + 1
-        text += map("f {0}/{3}/{0} {1}/{4}/{1} {2}/{5}/{2}".format, *columns.T.tolist())
+        corners, line = np.concatenate([corners, charts.corners], 1), "f {0}/{3}/{0} {1}/{4}/{1} {2}/{5}/{2}"
+    text += [f"usemtl {MATERIAL}", *map(line.format, *(corners + 1).T.tolist())]
     return ("\n".join(text) + "\n").encode()
 
 
@@ -234,11 +210,7 @@ def encode_glb(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, texture: Textur
     accessors = [_accessor(k, array) for k, array in enumerate(arrays.values())]
     accessors.append({"bufferView": len(arrays), "componentType": _UINT, "count": faces.size, "type": "SCALAR"})
     targets: list[int | None] = [*[_VERTICES] * len(arrays), _INDICES]
-    primitive = {
-        "attributes": {name: k for k, name in enumerate(arrays)},
-        "indices": len(arrays),
-        "material": 0,
-    }
+    primitive = {"attributes": {name: k for k, name in enumerate(arrays)}, "indices": len(arrays), "material": 0}
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "sl_nerfstudio"},
         "scene": 0,
@@ -252,12 +224,16 @@ def encode_glb(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, texture: Textur
         parts.append(encode_png(texture.image))
         targets.append(None)
         document["images"] = [{"bufferView": len(parts) - 1, "mimeType": "image/png"}]
-        document["samplers"] = [
-            {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS, "wrapS": _CLAMPED, "wrapT": _CLAMPED}
-        ]
+        filters = {"magFilter": _LINEAR, "minFilter": _LINEAR_MIPMAPS}
+        document["samplers"] = [{**filters, "wrapS": _CLAMPED, "wrapT": _CLAMPED}]
         document["textures"] = [{"sampler": 0, "source": 0}]
-    document["bufferViews"] = _views(parts, targets)
-    document["buffers"] = [{"byteLength": sum(map(len, parts))}]
+    views, at = [], 0
+    for part, target in zip(parts, targets, strict=True):
+        view = {"buffer": 0, "byteOffset": at, "byteLength": len(part)}
+        views.append(view if target is None else {**view, "target": target})
+        at += len(part)
+    document["bufferViews"] = views
+    document["buffers"] = [{"byteLength": at}]
     return _container(document, b"".join(parts))
 
 
@@ -275,11 +251,7 @@ def _attributes(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, texture: Textu
 
 def _material(grey: bool, textured: bool) -> dict[str, Any]:
     shade = float(_linear(np.array([GREY], np.uint8))[0]) / 65535 if grey else 1.0
-    surface: dict[str, Any] = {
-        "baseColorFactor": [shade, shade, shade, 1.0],
-        "metallicFactor": 0.0,
-        "roughnessFactor": 1.0,
-    }
+    surface: dict[str, Any] = {"baseColorFactor": [*[shade] * 3, 1.0], "metallicFactor": 0.0, "roughnessFactor": 1.0}
     if textured:
         surface["baseColorTexture"] = {"index": 0}
     return {"name": MATERIAL, "doubleSided": True, "pbrMetallicRoughness": surface}
@@ -297,16 +269,6 @@ def _accessor(view: int, array: ndarray) -> dict[str, Any]:
     if view == 0:  # positions must state their box
         found |= {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
     return found
-
-
-def _views(parts: list[bytes], targets: list[int | None]) -> list[dict[str, int]]:
-    """Say where in the buffer each part is, and what for."""
-    views, at = [], 0
-    for part, target in zip(parts, targets, strict=True):
-        view = {"buffer": 0, "byteOffset": at, "byteLength": len(part)}
-        views.append(view if target is None else {**view, "target": target})
-        at += len(part)
-    return views
 
 
 def _linear(colour: UInt8[ndarray, "*n"]) -> UInt16[ndarray, "*n"]:
@@ -406,7 +368,7 @@ def write_points(
     if path.suffix.lower() == ".las":
         write_atomic(path, encode_las(points * metres, normals, properties, metres))
     else:
-        write_atomic(path, encode_points(points, normals, properties, units))
+        write_atomic(path, _encode(_columns(points, normals, properties), [f"lengths in {units}"]))
     return len(points)
 
 

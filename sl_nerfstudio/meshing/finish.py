@@ -1,8 +1,10 @@
 """Finishing a mesh: its observed part marked, holes filled, a closed solid, fewer triangles."""
 
-from collections.abc import Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from operator import methodcaller
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,17 +76,13 @@ class ClosestSurface:
         found = self._scene.compute_closest_points(self._scaled(points))
         u, v = found["primitive_uvs"].numpy().T.astype(np.float64)
         there = found["points"].numpy() * self._scale + self._centre
-        return ClosestPoints(
-            np.linalg.norm(points - there, axis=1).astype(np.float64),
-            found["primitive_ids"].numpy().astype(np.int64),
-            np.stack([1 - u - v, u, v], 1),
-        )
+        distance = np.linalg.norm(points - there, axis=1).astype(np.float64)
+        return ClosestPoints(distance, found["primitive_ids"].numpy().astype(np.int64), np.stack([1 - u - v, u, v], 1))
 
 
 # A field whose zero level is closed: it ends at the walls of its box, and at planes.
 
 _MARGIN = 2e-3  # of the box's half side: what is nearer to its walls is outside
-
 _FACETS = 64  # of a convex hull, the largest ones: the many small ones are where the surface was observed
 
 Planes = list[tuple[Float64[ndarray, "3"], float]]
@@ -98,10 +96,8 @@ class ClosedField:
     signed distances, so walls and planes cut the solid with flat faces.
     """
 
-    def __init__(
-        self, field: Field, planes: Sequence[tuple[Float64[ndarray, "3"], float]], device: torch.device
-    ) -> None:
-        """`planes` are unit normals n and offsets d in the box's frame: points with n . p > d are above."""
+    def __init__(self, field: Field, planes: Planes, device: torch.device) -> None:
+        """`planes` are in the box's frame."""
         self._field = field
         self._normals = [(torch.as_tensor(n, dtype=torch.float32, device=device), d) for n, d in planes]
 
@@ -116,7 +112,7 @@ class ClosedField:
 def hull_planes(points: Float[ndarray, "n 3"], margin: float) -> Planes:
     """The largest faces of the convex hull of points, moved out by `margin`, with the points above them.
 
-    None if the points have no volume.
+    Without any if the points have no volume.
     """
     try:
         hull = ConvexHull(points)
@@ -150,28 +146,26 @@ def decimate(mesh: Mesh, triangles: int) -> Decimated:
 
     A mesh that has no more stays as it is.
     """
-    from sl_nerfstudio.late_imports import open3d as o3d
-
-    centre, scale = mesh.vertices.mean(0), max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
     fewer = mesh
     if len(mesh.faces) > triangles:
-        before = o3d.geometry.TriangleMesh(
-            o3d.utility.Vector3dVector((mesh.vertices - centre) / scale),
-            o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)),
-        )
-        after = before.simplify_quadric_decimation(triangles, boundary_weight=_BORDERS)
-        fewer = Mesh(np.asarray(after.vertices) * scale + centre, np.asarray(after.triangles).astype(np.int64))
+        collapse = methodcaller("simplify_quadric_decimation", triangles, boundary_weight=_BORDERS)
+        fewer = simplified(mesh, collapse)
         fewer = fewer.with_faces(np.ones(len(fewer.faces), dtype=bool))
     found = ClosestSurface(mesh).closest(fewer.vertices)
     back = ClosestSurface(fewer).closest(mesh.vertices).distance
-    return Decimated(
-        fewer,
-        mesh.faces[found.triangle, found.weights.argmax(1)],
-        found.distance,
-        len(mesh.faces),
-        float(np.sqrt((back**2).mean())),
-        float(max(back.max(), found.distance.max())),
-    )
+    nearest = mesh.faces[found.triangle, found.weights.argmax(1)]
+    rms, largest = float(np.sqrt((back**2).mean())), float(max(back.max(), found.distance.max()))
+    return Decimated(fewer, nearest, found.distance, len(mesh.faces), rms, largest)
+
+
+def simplified(mesh: Mesh, simplify: Callable[[Any], Any]) -> Mesh:
+    """What `simplify` makes of the mesh as a TriangleMesh of open3d, in units of its size and about its middle."""
+    from sl_nerfstudio.late_imports import open3d as o3d
+
+    centre, scale = mesh.vertices.mean(0), max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
+    vertices = o3d.utility.Vector3dVector((mesh.vertices - centre) / scale)
+    after = simplify(o3d.geometry.TriangleMesh(vertices, o3d.utility.Vector3iVector(mesh.faces.astype(np.int32))))
+    return Mesh(np.asarray(after.vertices) * scale + centre, np.asarray(after.triangles).astype(np.int64))
 
 
 _DENIED = 0.5

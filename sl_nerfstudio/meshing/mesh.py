@@ -22,10 +22,6 @@ class Mesh:
         """The mesh of frame b in frame a."""
         return Mesh(S_a_b.points(self.vertices), self.faces)
 
-    def with_vertices(self, keep: Bool[ndarray, "v"]) -> "Mesh":
-        """The triangles all of whose corners are kept, with the vertices that they use."""
-        return self.with_faces(keep[self.faces].all(1))
-
     def with_faces(self, keep: Bool[ndarray, "f"]) -> "Mesh":
         """The chosen triangles, with the vertices that they use."""
         used = self.corners_of(keep)
@@ -72,18 +68,19 @@ class Mesh:
 
     @cached_property
     def _normals(self) -> Float64[ndarray, "v 3"]:
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
-        normal = np.cross(b - a, c - a)
-        out = np.stack(
-            [np.bincount(self.faces.ravel(), np.repeat(normal[:, k], 3), len(self.vertices)) for k in range(3)], -1
-        )
+        corner, count = self.faces.ravel(), len(self.vertices)
+        out = np.stack([np.bincount(corner, np.repeat(values, 3), count) for values in self.face_cross().T], -1)
         length = np.linalg.norm(out, axis=1, keepdims=True)
         return out / np.where(length > 0, length, 1.0)
 
+    def face_cross(self) -> Float64[ndarray, "f 3"]:
+        """Twice the area times the unit normal of each triangle."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        return np.cross(b - a, c - a)
+
     def face_areas(self) -> Float64[ndarray, "f"]:
         """Area of each triangle."""
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
-        return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+        return np.linalg.norm(self.face_cross(), axis=1) / 2
 
     def edge_length(self) -> float:
         """Median length of an edge: the resolution of the mesh."""

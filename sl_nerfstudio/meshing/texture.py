@@ -155,8 +155,7 @@ def _look(
 def _look_up(frame: Frame, uv: Float64[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
     """Bilinear values of the frame's picture in [0, 1]; grey pictures in all three channels."""
     image = frame.read_color()
-    if image is None:
-        raise ValueError(f"frame {frame.name} was not captured without the pattern")
+    assert image is not None  # frames without a picture are not asked
     values = image.reshape(*image.shape[:2], -1) / np.iinfo(image.dtype).max
     place = (uv - 0.5).T[::-1]  # the centre of the first pixel is (0.5, 0.5)
     channels = [map_coordinates(values[..., c], place, order=1, mode="nearest") for c in range(values.shape[2])]
@@ -300,39 +299,38 @@ def surface_texture(mesh: Mesh, size: int, whole: Mesh, pictures: Pictures) -> T
     triangle, weights = draw_triangles(uv, size)
     texels = np.flatnonzero(triangle >= 0)
     image = np.full((size * size, 3), GREY, dtype=np.uint8)
-    surface, seen, pictures.task = _Surface(mesh, whole), 0, "colours of the texture"
+    closest, seen, pictures.task = None if mesh is whole else ClosestSurface(whole), 0, "colours of the texture"
     for first in range(0, len(texels), _AT_A_TIME):
         some = texels[first : first + _AT_A_TIME]
-        points, normals = surface.at(triangle.reshape(-1)[some], weights.reshape(-1, 3)[some])
+        at = triangle.reshape(-1)[some], weights.reshape(-1, 3)[some]
+        points, normals = _on_whole(mesh, whole, closest, *at)
         colours = pictures.colours(points, normals)
         image[some] = colours.rgb
         seen += int(colours.seen.sum())
     filled = _filled(image.reshape(size, size, 3), triangle >= 0)
-    texel = (float(mesh.face_areas().sum()) / max(_area(uv), 1e-300)) ** 0.5 / size
+    (ax, ay), (bx, by) = (uv[:, 1] - uv[:, 0]).T, (uv[:, 2] - uv[:, 0]).T
+    flat = float(np.abs(ax * by - ay * bx).sum()) / 2  # area of the charts
+    texel = (float(mesh.face_areas().sum()) / max(flat, 1e-300)) ** 0.5 / size
     return Textured(Texture(charts, filled), texel, seen / max(len(texels), 1), seconds)
 
 
-class _Surface:
-    """Points of a mesh, on the surface that it had before it was decimated."""
+def _on_whole(
+    mesh: Mesh, whole: Mesh, closest: ClosestSurface | None, triangle: Int[ndarray, "n"], weights: Float[ndarray, "n 3"]
+) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
+    """Places and unit normals on the whole mesh at weighted corners; weights beside a triangle are moved to its edge.
 
-    def __init__(self, mesh: Mesh, whole: Mesh) -> None:
-        self._mesh, self._whole, self._normals = mesh, whole, whole.vertex_normals()
-        self._closest = None if mesh is whole else ClosestSurface(whole)
-
-    def at(
-        self, triangle: Int[ndarray, "n"], weights: Float[ndarray, "n 3"]
-    ) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"]]:
-        """Places and unit normals at weighted corners; weights beside the triangle are moved to its edge."""
-        inside = np.maximum(weights, 0).astype(np.float64)
-        inside /= inside.sum(1, keepdims=True)
-        points = _mean(self._mesh.vertices, self._mesh.faces[triangle], inside)
-        if self._closest is not None:
-            found = self._closest.closest(points)
-            triangle, inside = found.triangle, found.weights
-            points = _mean(self._whole.vertices, self._whole.faces[triangle], inside)
-        normals = _mean(self._normals, self._whole.faces[triangle], inside)
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        return points, normals / np.where(length > 0, length, 1.0)
+    `closest` is of the whole mesh, None if it is the same.
+    """
+    inside = np.maximum(weights, 0).astype(np.float64)
+    inside /= inside.sum(1, keepdims=True)
+    points = _mean(mesh.vertices, mesh.faces[triangle], inside)
+    if closest is not None:
+        found = closest.closest(points)
+        triangle, inside = found.triangle, found.weights
+        points = _mean(whole.vertices, whole.faces[triangle], inside)
+    normals = _mean(whole.vertex_normals(), whole.faces[triangle], inside)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    return points, normals / np.where(length > 0, length, 1.0)
 
 
 def _mean(
@@ -350,9 +348,3 @@ def _filled(image: UInt8[ndarray, "n n 3"], known: Bool[ndarray, "n n"]) -> UInt
     of_label = np.zeros((int(label.max()) + 1, 3), np.uint8)
     of_label[label[known]] = image[known]
     return of_label[label]
-
-
-def _area(corners: Float64[ndarray, "f 3 2"]) -> float:
-    """Total area of triangles in the plane."""
-    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return float(np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum()) / 2

@@ -22,7 +22,7 @@ from sl_nerfstudio.meshing import visibility as loops
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 from sl_nerfstudio.meshing.visibility import LEAST_PX, MEDIANS, MOST_PX, Occluder, dot, lit_vertices, write_rows
 from sl_nerfstudio.parallel import compiled_range, parallel, results, threads
-from sl_nerfstudio.scan.types import Frame, Scan
+from sl_nerfstudio.scan.types import Scan
 
 # How the residuals of one frame depend on the surface, on the frame's poses and on the intrinsics.
 #
@@ -95,23 +95,17 @@ def point_equations(d: FrameDevices, p_world: Float[Tensor, "n 3"]) -> tuple[Ten
     Returns those by the point (n, 4, 3), and by delta, rho and the intrinsics (n, 4, 18). Unlike a surface, a point
     cannot slide along itself: lengths between points depend on all of its motion.
     """
-    p = transform(inverse(d.T_world_camera), p_world)
-    K, P = project_jacobian(d.camera, p), _projector_jacobian(d, p)
-    R = d.T_world_camera[:3, :3].T
-    by_point = torch.cat([K, P], 1) @ R
+    p, T = transform(inverse(d.T_world_camera), p_world), inverse(d.T_camera_projector)
+    K, P = project_jacobian(d.camera, p), project_jacobian(d.projector, transform(T, p)) @ T[:3, :3]
+    by_point = torch.cat([K, P], 1) @ d.T_world_camera[:3, :3].T
     by_delta = torch.cat([-by_point, by_point @ hat(p_world)], -1)
     by_rho = torch.cat([torch.zeros_like(by_delta[:, :2]), torch.cat([-P, P @ hat(p)], -1)], 1)
     uv_camera = project(d.camera, p)[0]
-    uv_projector = project(d.projector, transform(inverse(d.T_camera_projector), p))[0]
+    uv_projector = project(d.projector, transform(T, p))[0]
     zero = p.new_zeros(len(p), 2, 3)
     camera = torch.cat([by_intrinsics(d.camera, uv_camera), zero], 1)
     projector = torch.cat([zero, by_intrinsics(d.projector, uv_projector)], 1)
     return by_point, torch.cat([by_delta, by_rho, camera, projector], -1)
-
-
-def _projector_jacobian(d: FrameDevices, p_camera: Float[Tensor, "n 3"]) -> Float[Tensor, "n 2 3"]:
-    T = inverse(d.T_camera_projector)
-    return project_jacobian(d.projector, transform(T, p_camera)) @ T[:3, :3]
 
 
 # For every vertex of a mesh, the frames that measured it: what they decoded there, and under which geometry.
@@ -152,47 +146,21 @@ def views_by_frame(
     predicts. As many frames are in memory at a time as there are threads.
     """
     chosen = np.arange(len(mesh.vertices), dtype=np.int64) if chosen is None else chosen
-    points, normals = mesh.vertices, mesh.vertex_normals()
-    occluder, all_frames = Occluder(mesh), list(enumerate(scan.frames))
-    for first in track(range(0, len(all_frames), threads()), task):
-        frames = all_frames[first : first + threads()]
-        yield from results(
-            [partial(_views_of, points, normals, chosen, occluder, f, scan, poses, k) for k, f in frames]
-        )
+    points, normals, occluder = mesh.vertices, mesh.vertex_normals(), Occluder(mesh)
+
+    def views(k: int) -> FrameViews:
+        frame, T = scan.frames[k], (poses.T_world_camera[k], poses.T_world_projector[k])
+        seen, _ = lit_vertices(points, normals, chosen, occluder, frame.camera, scan.projector, *T)
+        view = view_surface(devices_of(scan, poses, k), torch.from_numpy(points[seen]), torch.from_numpy(normals[seen]))
+        return _confirmed(seen, view, frame.read_coords())
+
+    numbers = range(len(scan.frames))
+    for first in track(numbers[:: threads()], task):
+        yield from results([partial(views, k) for k in numbers[first : first + threads()]])
 
 
-@dataclass(frozen=True)
-class VertexViews:
-    """Pairs of a vertex and a frame that confirms it, by vertex."""
-
-    vertex: Int64[ndarray, "m"]
-    frame: Int64[ndarray, "m"]
-    residual: Float[ndarray, "m 2"]  # as in FrameViews
-
-
-def collect_views(mesh: Mesh, scan: Scan, poses: DevicePoses, chosen: Int64[ndarray, "c"], task: str) -> VertexViews:
-    """Find all frames that confirm each of the chosen vertices."""
-    found = list(views_by_frame(mesh, scan, poses, chosen, task))
-    vertex, residual = (np.concatenate([getattr(one, name) for one in found]) for name in ("vertex", "residual"))
-    order = np.argsort(vertex, kind="stable")
-    frame = np.repeat(np.arange(len(found)), [len(one.vertex) for one in found])
-    return VertexViews(vertex[order], frame[order], residual[order])
-
-
-def _views_of(
-    points: Float[ndarray, "v 3"],
-    normals: Float[ndarray, "v 3"],
-    chosen: Int64[ndarray, "c"],
-    occluder: Occluder,
-    frame: Frame,
-    scan: Scan,
-    poses: DevicePoses,
-    k: int,
-) -> FrameViews:
-    T = poses.T_world_camera[k], poses.T_world_projector[k]
-    seen = lit_vertices(points, normals, chosen, occluder, frame.camera, scan.projector, *T).vertex
-    devices, coords = devices_of(scan, poses, k), frame.read_coords()
-    view = view_surface(devices, torch.from_numpy(points[seen]), torch.from_numpy(normals[seen]))
+def _confirmed(seen: Int64[ndarray, "n"], view: SurfaceView, coords: Float[ndarray, "h w 2"]) -> FrameViews:
+    """The vertices, of those that a frame sees, whose predictions its decoded coordinates confirm."""
     uv = view.uv_camera.numpy()
     column, row = np.floor(uv).astype(np.int64).T
     at_pixel = np.einsum("nij,nj->ni", view.by_pixel.numpy(), np.stack([column, row], 1) + 0.5 - uv)
@@ -319,7 +287,7 @@ class Smoothing:
     def __init__(self, mesh: Mesh, area: float) -> None:
         """A Gaussian of standard deviation d averages as much as a disk of area 4 pi d^2."""
         count = len(mesh.vertices)
-        a, b = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]).T
+        a, b = mesh.edges().T
         ends = np.concatenate([a, b]), np.concatenate([b, a])
         links = coo_array((np.ones(2 * len(a)), ends), (count, count)).tocsr()
         degree = np.maximum(np.asarray(links.sum(1)).reshape(-1), 1.0)

@@ -265,14 +265,6 @@ class Occluder:
         return self._scene.test_occlusions(self._o3d.core.Tensor(rays), tnear=0.0, tfar=1.0).numpy()
 
 
-@dataclass(frozen=True)
-class LitVertices:
-    """Vertices that a frame should see and light, and where."""
-
-    vertex: Int64[ndarray, "m"]
-    uv: Float[ndarray, "m 2 2"]  # camera pixels and pattern pixels
-
-
 def lit_vertices(
     vertices: Float[ndarray, "v 3"],
     normals: Float[ndarray, "v 3"],
@@ -282,16 +274,19 @@ def lit_vertices(
     projector: Device,
     T_world_camera: Float[ndarray, "4 4"],
     T_world_projector: Float[ndarray, "4 4"],
-) -> LitVertices:
-    """Chosen vertices that face both devices, project into image and pattern, and are hidden from neither."""
-    views = ((camera, T_world_camera), (projector, T_world_projector))
-    packed = np.stack([packed_device(device, T) for device, T in views])
+) -> tuple[Int64[ndarray, "m"], Float[ndarray, "m 2 2"]]:
+    """Chosen vertices that face both devices, project into image and pattern, and are hidden from neither.
+
+    With the pixels at which camera and projector have them.
+    """
+    poses = T_world_camera, T_world_projector
+    packed = np.stack(list(map(packed_device, (camera, projector), poses)))
     uv, faces = np.empty((len(chosen), 2, 2)), np.empty(len(chosen), np.bool_)
     _project_facing(len(chosen), vertices, normals, chosen, packed, uv, faces)
     left = np.flatnonzero(faces)
-    for _, T in views:
+    for T in poses:
         left = left[~occluder.hidden(vertices, normals, chosen[left], np.asarray(T[:3, 3], dtype=np.float64))]
-    return LitVertices(chosen[left], uv[left])
+    return chosen[left], uv[left]
 
 
 def packed_device(device: Device, T_world_device: Float[ndarray, "4 4"]) -> Float[ndarray, "26"]:
@@ -439,15 +434,15 @@ def visible_vertices(
     T_world_projector: Float[ndarray, "4 4"],
 ) -> VisibleVertices:
     """Chosen vertices that a frame should see and light (see `lit_vertices`), compared with what it decoded."""
-    views = ((frame.camera, T_world_camera), (projector, T_world_projector))
-    lit = lit_vertices(vertices, normals, chosen, occluder, frame.camera, projector, T_world_camera, T_world_projector)
-    mask, coords, count = frame.read_mask(), frame.read_coords(), len(lit.vertex)
+    T = T_world_camera, T_world_projector
+    lit, uv = lit_vertices(vertices, normals, chosen, occluder, frame.camera, projector, *T)
+    mask, coords, count = frame.read_mask(), frame.read_coords(), len(lit)
     offsets, outside = np.full((count, 2), np.nan), np.empty((count, 2), np.bool_)
-    packed = np.stack([packed_device(device, T) for device, T in views])
+    packed = np.stack(list(map(packed_device, (frame.camera, projector), T)))
     images = coords, mask, np.asarray(binary_dilation(mask, np.ones((3, 3), dtype=bool), iterations=OFF_MASK_PX))
-    compare_decoded(count, vertices, normals, lit.vertex, lit.uv, *images, packed, MOST_PX, offsets, outside)
+    compare_decoded(count, vertices, normals, lit, uv, *images, packed, MOST_PX, offsets, outside)
     off, out = outside.T
-    return VisibleVertices(lit.vertex, off, out & ~off, *offsets.T)
+    return VisibleVertices(lit, off, out & ~off, *offsets.T)
 
 
 # Trim a mesh to what the frames observed: the field invents the surface that closes unseen sides.
@@ -544,7 +539,7 @@ def _without(mesh: Mesh, contradicted: Bool[ndarray, "v"], observed: Bool[ndarra
     edges = mesh.edges()
     count, label = _components(len(contradicted), edges[~contradicted[edges].any(1)])
     real = np.bincount(label, observed, count) > 0
-    return mesh.with_vertices(~contradicted & real[label])
+    return mesh.with_faces((~contradicted & real[label])[mesh.faces].all(1))
 
 
 def _components(n: int, edges: Int64[ndarray, "e 2"]) -> tuple[int, Int64[ndarray, "n"]]:
@@ -565,11 +560,10 @@ def _small_gaps(mesh: Mesh, observed: Bool[ndarray, "v"], counts: FrameCounts) -
     bordering = np.zeros(count, dtype=bool)
     mixed = edges[observed[edges[:, 0]] != observed[edges[:, 1]]]
     bordering[label[mixed[gap[mixed]]]] = True
-    members = np.bincount(label[gap], minlength=count)
-    several = np.bincount(label[gap], (counts.contradicted[gap] >= _SEVERAL).astype(float), count)
-    in_mask = np.bincount(label[gap], (counts.inconclusive[gap] > 0).astype(float), count)
-    silent, denied = (
-        np.bincount(label[gap], v[gap].astype(float), count) for v in (counts.inconclusive, counts.contradicted)
+    silence, denial = counts.inconclusive, counts.contradicted
+    members, several, in_mask, silent, denied = (
+        np.bincount(label[gap], values[gap].astype(float), count)
+        for values in (gap, denial >= _SEVERAL, silence > 0, silence, denial)
     )
     undecoded = (in_mask > UNDECODED_MEMBERS * members) & (denied < CONTRADICTED * silent)
     share = np.where(undecoded, UNDECODED_HOLE_SHARE, HOLE_SHARE)

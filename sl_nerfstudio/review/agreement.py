@@ -28,7 +28,7 @@ from sl_nerfstudio.geometry.numerics import (
     geman_mcclure_weight,
     nearest_distances,
 )
-from sl_nerfstudio.geometry.triangulation import closest_approach, triangulate, world_pixels
+from sl_nerfstudio.geometry.triangulation import Triangulation, closest_approach, triangulate, world_pixels
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan.types import PoseSigma, Scan
 
@@ -350,24 +350,30 @@ def _scene(cameras: Sequence[Device], projector: Device, poses: DevicePoses, map
     """World to scene: the centre of the decoded surface becomes the origin, its radius one."""
     parts = [np.zeros((0, 3))]
     for k, (camera, T_c, T_p) in enumerate(zip(cameras, poses.T_world_camera, poses.T_world_projector, strict=True)):
-        image = maps.image(k).numpy()
-        decoded = np.flatnonzero(np.isfinite(image).all(-1))
-        some = decoded[evenly_spaced(len(decoded), min(_POINTS_PER_FRAME, len(decoded)))]
-        row, column = np.divmod(some, image.shape[1])
-        found = triangulate(
-            Intrinsics.of(camera, torch.float64),
-            torch.from_numpy(T_c),
-            torch.from_numpy(np.stack([column, row], -1) + 0.5),
-            Intrinsics.of(projector, torch.float64),
-            torch.from_numpy(T_p),
-            torch.from_numpy(image[row, column].astype(np.float64)),
-        )
+        _, found = triangulate_some(camera, projector, T_c, T_p, maps.image(k).numpy(), _POINTS_PER_FRAME)
         good = found.p_world.isfinite().all(-1) & (found.depth_camera > 0) & (found.depth_projector > 0)
         parts.append(found.p_world[good].numpy())
     points: Float[ndarray, "n 3"] = np.concatenate(parts)
-    if len(points) < 2:
-        return Similarity.identity()
-    return centred_on(points, _EDGE)
+    return centred_on(points, _EDGE) if len(points) > 1 else Similarity.identity()
+
+
+def triangulate_some(
+    camera: Device,
+    projector: Device,
+    T_world_camera: Float64[ndarray, "4 4"],
+    T_world_projector: Float64[ndarray, "4 4"],
+    coords: Float32[ndarray, "_h _w 2"],
+    most: int,
+) -> tuple[Float64[Tensor, "n 2"], Triangulation]:
+    """Some decoded camera pixels, evenly chosen, and the points that their coordinates make of them."""
+    decoded = np.flatnonzero(np.isfinite(coords).all(-1))
+    some = decoded[evenly_spaced(len(decoded), min(most, len(decoded)))]
+    row, column = np.divmod(some, coords.shape[1])
+    uv = torch.from_numpy(np.stack([column, row], -1) + 0.5)
+    uv_projector = torch.from_numpy(coords[row, column].astype(np.float64))
+    K_c, K_p = (Intrinsics.of(device, torch.float64) for device in (camera, projector))
+    T_c, T_p = torch.from_numpy(T_world_camera), torch.from_numpy(T_world_projector)
+    return uv, triangulate(K_c, T_c, uv, K_p, T_p, uv_projector)
 
 
 # Groups of frames: those that agree with each other, and weak places in a graph of pairs.

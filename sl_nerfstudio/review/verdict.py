@@ -90,7 +90,7 @@ class DepartedFrame:
     stated: bool = True  # by the scan; otherwise what is usual
 
 
-def departed_frames(scan: Scan, poses: DevicePoses, usual_deg: float = USUAL_FRAME_ROTATION_DEG) -> list[DepartedFrame]:
+def departed_frames(scan: Scan, poses: DevicePoses) -> list[DepartedFrame]:
     """Frames whose cameras are turned by far more than the uncertainty of their starts: stated, or else usual.
 
     Positions are not compared: they depend on turns by as much as the camera is away from what it sees.
@@ -98,7 +98,7 @@ def departed_frames(scan: Scan, poses: DevicePoses, usual_deg: float = USUAL_FRA
     found = []
     for frame, T_start, T_end in zip(scan.frames, scan.poses.T_world_camera, poses.T_world_camera, strict=True):
         stated = frame.pose_sigma
-        sigma = usual_deg if stated is None else stated.camera_rotation_deg
+        sigma = USUAL_FRAME_ROTATION_DEG if stated is None else stated.camera_rotation_deg
         turned = angle_deg(T_start[:3, :3].T @ T_end[:3, :3])
         if turned > _MOST_SIGMA * np.sqrt(3) * sigma:
             found.append(DepartedFrame(frame.name, turned, sigma, stated is not None))
@@ -160,25 +160,18 @@ def shortcomings(found: BoardCalibration) -> tuple[str, ...]:
 
 
 def _reasons(found: BoardCalibration) -> Iterator[Reason]:
+    """Every judgement; `worst` leaves out what is good."""
     lacking = shortcomings(found)
     because = f"; {', and '.join(lacking)}" if lacking else ""
     for k, (device, sigma) in enumerate(zip(found.adjusted.rig.devices, found.sigmas, strict=True)):
         name = DEVICES[k]
         focal, centre = sigma.focal() / device.fl_x, sigma.centre() / device.fl_x
-        if (band := _band(focal, _FOCAL)) != "good":
-            yield Reason(
-                band, f"the focal length of the {name} is uncertain by {focal:.2%} (1 sigma){because}", "boards"
-            )
-        if (band := _band(centre, _CENTRE)) != "good":
-            yield Reason(
-                band,
-                f"the principal point of the {name} is uncertain by {sigma.centre():.0f} px (1 sigma){because}",
-                "boards",
-            )
-        if (band := _band(found.rms_px[k], _RMS_PX)) != "good":
-            yield Reason(
-                band, f"corners are {found.rms_px[k]:.2f} px (RMS) from where the {name} should see them", "boards"
-            )
+        uncertain = f"of the {name} is uncertain by"
+        yield Reason(_band(focal, _FOCAL), f"the focal length {uncertain} {focal:.2%} (1 sigma){because}", "boards")
+        pixels = f"{sigma.centre():.0f} px (1 sigma){because}"
+        yield Reason(_band(centre, _CENTRE), f"the principal point {uncertain} {pixels}", "boards")
+        corners = f"corners are {found.rms_px[k]:.2f} px (RMS) from where the {name} should see them"
+        yield Reason(_band(found.rms_px[k], _RMS_PX), corners, "boards")
         if found.left_out.error_px[k] > _GOOD_PREDICTION * max(found.rms_px[k], found.adjusted.sigma_px[k]):
             yield Reason(
                 "acceptable",
@@ -216,9 +209,7 @@ class FrameFacts:
     shared_decoded: float | None = None  # of the surface that other frames show, where this one sees the pattern
     missing_share: float | None = None  # of the surface that other frames show in its sight: where it saw no pattern
     own_share: float | None = None  # of the decoded pixels, those that agree with the pose of the frame's own projector
-    rays_px: float | None = (
-        None  # how far its rays miss each other under a pose that states its uncertainty, pattern px
-    )
+    rays_px: float | None = None  # how far its rays miss each other, where its pose states an uncertainty, pattern px
     stated_px: float | None = None  # of this, what the stated uncertainty explains, 1 sigma
     degeneracies: tuple[str, ...] = ()  # why the frame itself determines the pose of its projector only weakly
 

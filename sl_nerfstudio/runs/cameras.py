@@ -21,7 +21,7 @@ from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.numerics import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import world_pixels
 from sl_nerfstudio.meshing.mesh import GREY, Mesh
-from sl_nerfstudio.meshing.uncertainty import collect_views
+from sl_nerfstudio.meshing.uncertainty import views_by_frame
 from sl_nerfstudio.scan.types import Scan
 
 # Cameras and projectors with their poses, in the unit and the axes of other programs.
@@ -56,14 +56,9 @@ class PosedFrames:
 
 def posed_frames(scan: Scan, poses: DevicePoses, unplaced: Sequence[bool]) -> PosedFrames:
     """The devices of a scan at refined poses."""
-    cameras = tuple(
-        PosedDevice(frame.name, frame.camera, T, frame.image_path)
-        for frame, T in zip(scan.frames, poses.T_world_camera, strict=True)
-    )
-    projectors = tuple(
-        PosedDevice(frame.name, scan.projector, T, scan.pattern_path)
-        for frame, T in zip(scan.frames, poses.T_world_projector, strict=True)
-    )
+    every = list(zip(scan.frames, poses.T_world_camera, poses.T_world_projector, strict=True))
+    cameras = tuple(PosedDevice(f.name, f.camera, T, f.image_path) for f, T, _ in every)
+    projectors = tuple(PosedDevice(f.name, scan.projector, T, scan.pattern_path) for f, _, T in every)
     return PosedFrames(cameras, projectors, tuple(not lost for lost in unplaced))
 
 
@@ -181,8 +176,8 @@ def encode_blender(frames: PosedFrames, unit_m: float | None) -> bytes:
     factor = unit_m or 1.0
     size = 0.1 * factor * _distance(frames)
     devices = {
-        "cameras": _records(frames.cameras, frames.placed, "camera", factor, size),
-        "projectors": _records(frames.projectors, frames.placed, "projector", factor, size),
+        f"{kind}s": _records(posed, frames.placed, kind, factor, size)
+        for kind, posed in (("camera", frames.cameras), ("projector", frames.projectors))
     }
     text = _SCRIPT.replace("@DEVICES@", json.dumps(devices, indent=1, ensure_ascii=True))
     text = text.replace("@UNIT@", "metres" if unit_m else "the scan's arbitrary unit").replace("@SCALE@", f"{factor:g}")
@@ -229,23 +224,15 @@ class SurfaceTracks:
 def surface_tracks(mesh: Mesh, colour: UInt8[ndarray, "v 3"] | None, scan: Scan, poses: DevicePoses) -> SurfaceTracks:
     """Vertices of a mesh, evenly chosen."""
     chosen = evenly_spaced(len(mesh.vertices), min(_POINTS, len(mesh.vertices)))
-    views = collect_views(mesh, scan, poses, chosen, "points for COLMAP")
-    p_world = mesh.vertices[views.vertex]
-    uv_camera, uv_projector = np.zeros((len(p_world), 2)), np.zeros((len(p_world), 2))
-    for k, frame in enumerate(scan.frames):
-        mine = views.frame == k
-        uv_camera[mine] = world_pixels(frame.camera, poses.T_world_camera[k], p_world[mine])[0]
-        uv_projector[mine] = world_pixels(scan.projector, poses.T_world_projector[k], p_world[mine])[0]
+    parts: list[tuple[ndarray, ...]] = []
+    for k, view in enumerate(views_by_frame(mesh, scan, poses, chosen, "points for COLMAP")):
+        p_world = mesh.vertices[view.vertex]
+        uv_camera = world_pixels(scan.frames[k].camera, poses.T_world_camera[k], p_world)[0]
+        decoded = world_pixels(scan.projector, poses.T_world_projector[k], p_world)[0] - view.residual
+        frame, residual = np.full(len(p_world), k), np.linalg.norm(view.residual, axis=1)
+        parts.append((np.searchsorted(chosen, view.vertex), frame, uv_camera, decoded, residual))
     rgb = np.full((len(mesh.vertices), 3), GREY, dtype=np.uint8) if colour is None else colour
-    return SurfaceTracks(
-        mesh.vertices[chosen],
-        rgb[chosen],
-        np.searchsorted(chosen, views.vertex).astype(np.int64),
-        views.frame,
-        uv_camera,
-        uv_projector - views.residual,
-        np.linalg.norm(views.residual, axis=1).astype(np.float64),
-    )
+    return SurfaceTracks(mesh.vertices[chosen], rgb[chosen], *map(np.concatenate, zip(*parts, strict=True)))
 
 
 _SINE = (-1 / 6, 1 / 120, -1 / 5040, 1 / 362880)
@@ -282,9 +269,8 @@ def require_possible(frames: PosedFrames, root: Path) -> None:
 def encode_colmap(frames: PosedFrames, root: Path, tracks: SurfaceTracks) -> dict[str, bytes]:
     """The files by name; images are named by their paths below `root`, frames that are not placed are left out.
 
-    Raises UserError as `require_possible` does.
+    The frames are `require_possible`.
     """
-    require_possible(frames, root)
     placed = [k for k, good in enumerate(frames.placed) if good]
     kinds = list(dict.fromkeys(frames.cameras[k].device for k in placed))
     devices = [*kinds, frames.projectors[0].device]
@@ -292,32 +278,26 @@ def encode_colmap(frames: PosedFrames, root: Path, tracks: SurfaceTracks) -> dic
     images: list[str] = []
     for k in placed:
         camera, projector = frames.cameras[k], frames.projectors[k]
-        name = camera.image.relative_to(root).as_posix()
+        capture = camera.image.relative_to(root).as_posix()
         mine = np.flatnonzero(tracks.frame == k)
-        points = tracks.point[mine].tolist()
-        number = kinds.index(camera.device) + 1
-        images += [_image(2 * k + 1, camera, number, name), _points(tracks.uv_camera[mine].tolist(), points)]
-        name = f"projector/{projector.frame}.png"
-        images += [
-            _image(2 * k + 2, projector, len(devices), name),
-            _points(tracks.uv_projector[mine].tolist(), points),
-        ]
+        for number, device, kind, name, uv in (
+            (2 * k + 1, camera, kinds.index(camera.device) + 1, capture, tracks.uv_camera[mine]),
+            (2 * k + 2, projector, len(devices), f"projector/{projector.frame}.png", tracks.uv_projector[mine]),
+        ):
+            seen = zip(uv.tolist(), tracks.point[mine].tolist(), strict=True)
+            images.append(f"{number} {_pose(np.linalg.inv(device.T_world_cv))} {kind} {name}")
+            images.append(" ".join(f"{x:.4f} {y:.4f} {point + 1}" for (x, y), point in seen))
     rigs, shots = _rigs(frames, placed, kinds)
-    return {
-        "rigs.txt": _colmap_text(
-            "# RIG_ID NUM_SENSORS REF_TYPE REF_ID, then (TYPE ID HAS_POSE QW QX QY QZ TX TY TZ)[]", rigs
+    files = {
+        "rigs": ("RIG_ID NUM_SENSORS REF_TYPE REF_ID, then (TYPE ID HAS_POSE QW QX QY QZ TX TY TZ)[]", rigs),
+        "frames": ("FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA, then (TYPE SENSOR_ID IMAGE_ID)[]", shots),
+        "cameras": ("CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; the last one is the projector", cameras),
+        "images": (
+            "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then (X Y POINT3D_ID)[]; world to device, +y down", images,
         ),
-        "frames.txt": _colmap_text(
-            "# FRAME_ID RIG_ID QW QX QY QZ TX TY TZ NUM_DATA, then (TYPE SENSOR_ID IMAGE_ID)[]", shots
-        ),
-        "cameras.txt": _colmap_text("# CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]; the last one is the projector", cameras),
-        "images.txt": _colmap_text(
-            "# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then (X Y POINT3D_ID)[]; world to device, +y down", images
-        ),
-        "points3D.txt": _colmap_text(
-            "# POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID POINT2D_IDX)", _tracks(tracks, placed)
-        ),
-    }
+        "points3D": ("POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID POINT2D_IDX)", _tracks(tracks, placed)),
+    }  # fmt: skip
+    return {f"{name}.txt": "\n".join([f"# {head}", *lines, ""]).encode() for name, (head, lines) in files.items()}
 
 
 def _rigs(frames: PosedFrames, placed: Sequence[int], kinds: Sequence[Device]) -> tuple[list[str], list[str]]:
@@ -351,24 +331,12 @@ def _pose(T: Float64[ndarray, "4 4"]) -> str:
     return " ".join(f"{v:.15g}" for v in (w, x, y, z, *T[:3, 3].tolist()))
 
 
-def _colmap_text(comment: str, lines: Sequence[str]) -> bytes:
-    return ("\n".join([comment, *lines]) + "\n").encode()
-
-
 def _camera(device: Device) -> str:
     size, focal = f"{device.w} {device.h}", f"{device.fl_x!r} {device.fl_y!r} {device.cx!r} {device.cy!r}"
     distortion = (device.k1, device.k2, device.p1, device.p2)
     if device.model == "OPENCV":
         return f"OPENCV {size} {focal} {' '.join(map(repr, distortion))}"
     return f"OPENCV_FISHEYE {size} {focal} {' '.join(map(repr, _SINE))}"
-
-
-def _image(number: int, device: PosedDevice, camera: int, name: str) -> str:
-    return f"{number} {_pose(np.linalg.inv(device.T_world_cv))} {camera} {name}"
-
-
-def _points(uv: list[list[float]], points: list[int]) -> str:
-    return " ".join(f"{x:.4f} {y:.4f} {point + 1}" for (x, y), point in zip(uv, points, strict=True))
 
 
 def _tracks(tracks: SurfaceTracks, placed: Sequence[int]) -> list[str]:

@@ -1,6 +1,5 @@
 """The surface and the refined poses of a trained run, extracted and written."""
 
-import io
 import platform
 import shlex
 import time
@@ -59,15 +58,9 @@ from sl_nerfstudio.scan.document import TRANSFORMS
 from sl_nerfstudio.scan.images import ARRAY_DAMAGE
 from sl_nerfstudio.scan.types import UNITS
 from sl_nerfstudio.scan.write import encode_json, sigma_fields
-from sl_nerfstudio.storage import write_atomic
+from sl_nerfstudio.storage import encode_npz, write_atomic
 
 # Cameras and trajectories of a run, written for other programs.
-
-
-def require_possible_files(settings: ExportSettings, model: TrainedModel) -> None:
-    """Raise UserError, before anything slow, for what a format cannot hold."""
-    if "colmap" in settings.cameras:
-        require_possible(posed_frames(model.scan, model.poses(), model.unplaced()), model.scan.root)
 
 
 def write_device_files(
@@ -103,10 +96,8 @@ def write_covariance(folder: Path, scan: Scan, joint: JointCovariance | None) ->
     if joint is None:
         path.unlink(missing_ok=True)
         return
-    buffer = io.BytesIO()
     names = np.array([frame.name for frame in scan.frames])
-    np.savez_compressed(buffer, factor=joint.factor, frames=names, units=np.array(scan.units))
-    write_atomic(path, buffer.getvalue())
+    write_atomic(path, encode_npz({"factor": joint.factor, "frames": names, "units": np.array(scan.units)}))
 
 
 def read_covariance(folder: Path, scan: Scan) -> JointCovariance | None:
@@ -230,16 +221,27 @@ class ObjectCut:
 
 def separate_scan(scan: Scan, poses: DevicePoses) -> Separation:
     """The object in the triangulated points of a scan, found as sl-process does. Raises UserError without points."""
-    return separate(_decoded_frames(scan, poses))
+    frames = []
+    for k, frame in enumerate(track(scan.frames, "object only")):
+        coords = frame.read_coords()
+        if np.isfinite(coords).all(-1).any():
+            T = poses.T_world_camera[k], poses.T_world_projector[k]
+            whole = DecodedFrame(frame.camera, scan.projector, *T, coords, frame.read_mask())
+            frames.append(whole.thinned(PIXELS_PER_FRAME))
+    if not frames:
+        raise UserError(
+            f"{scan.root}: no frame has decoded coordinates, so --object-only cannot find the object\n"
+            "    cause:  the scan has images and poses only\n    remedy: leave --object-only out"
+        )
+    return separate(frames)
 
 
-def cut_object(mesh: Mesh, found: Separation) -> ObjectCut:
-    """Remove planes around the object and what is not connected to it. Raises UserError if nothing is left."""
-    return object_cut(mesh, found, found.keeps(mesh.vertices)[mesh.faces].all(1))
+def cut_object(mesh: Mesh, found: Separation, chosen: Bool[ndarray, "f"] | None = None) -> ObjectCut:
+    """Keep the chosen triangles; by default all but planes around the object and what is not connected to it.
 
-
-def object_cut(mesh: Mesh, found: Separation, kept: Bool[ndarray, "f"]) -> ObjectCut:
-    """What it means to keep these triangles. Raises UserError if there are none."""
+    Raises UserError if nothing is left.
+    """
+    kept = found.keeps(mesh.vertices)[mesh.faces].all(1) if chosen is None else chosen
     if not kept.any():
         raise UserError(
             "--object-only leaves nothing of the surface\n"
@@ -260,25 +262,6 @@ def planes_below(found: Separation, S_scene_world: Similarity) -> Planes:
         offset = S_scene_world.scale * (plane.offset + one.tolerance) + float(normal @ S_scene_world.t)
         planes.append((normal, offset))
     return planes
-
-
-def _decoded_frames(scan: Scan, poses: DevicePoses) -> list[DecodedFrame]:
-    """All frames that have coordinates, thinned as they are read."""
-    frames = []
-    for k, frame in enumerate(track(scan.frames, "object only")):
-        coords = frame.read_coords()
-        if np.isfinite(coords).all(-1).any():
-            whole = DecodedFrame(
-                frame.camera, scan.projector, poses.T_world_camera[k], poses.T_world_projector[k], coords,
-                frame.read_mask(),
-            )  # fmt: skip
-            frames.append(whole.thinned(PIXELS_PER_FRAME))
-    if not frames:
-        raise UserError(
-            f"{scan.root}: no frame has decoded coordinates, so --object-only cannot find the object\n"
-            "    cause:  the scan has images and poses only\n    remedy: leave --object-only out"
-        )
-    return frames
 
 
 # The surface of a trained run, as an export wants it: observed, filled, cut out, or closed.
@@ -349,8 +332,9 @@ def _solid(model: TrainedModel, settings: ExportSettings) -> ExtractedSurface:
     solid = extract_mesh(field, settings.resolution, device=model.device).mapped(world)
     second = time.perf_counter() - start
     observed = _same_vertices(solid, whole, real)
-    kept = _pieces_with(solid, observed[solid.faces].all(1))
-    cut = None if found is None else object_cut(solid, found, kept)
+    piece = solid.component_of_faces()
+    kept = np.bincount(piece, observed[solid.faces].all(1).astype(float))[piece] > 0
+    cut = None if found is None else cut_object(solid, found, kept)
     return ExtractedSurface(MarkedMesh(solid, ~observed).with_faces(kept), trimmed, None, cut, 0, first + second)
 
 
@@ -360,12 +344,6 @@ def _same_vertices(mesh: Mesh, other: Mesh, chosen: Bool[ndarray, "w"]) -> Bool[
         return np.zeros(len(mesh.vertices), dtype=bool)
     distance, _ = KDTree(other.vertices[chosen]).query(mesh.vertices)
     return np.asarray(distance < _SAME * other.edge_length())
-
-
-def _pieces_with(mesh: Mesh, chosen: Bool[ndarray, "f"]) -> Bool[ndarray, "f"]:
-    """All triangles of the connected pieces that have some of the chosen ones."""
-    piece = mesh.component_of_faces()
-    return np.bincount(piece, chosen.astype(float))[piece] > 0
 
 
 # How the surface stands in a file for a program in which z is up.
@@ -445,7 +423,8 @@ def export_run(run: TrainedRun, settings: ExportSettings) -> Exported:
     Raises UserError if there is no surface, if no part of it was observed, or if a file cannot be written.
     """
     model, start = run.model, time.perf_counter()
-    require_possible_files(settings, model)
+    if "colmap" in settings.cameras:  # before anything slow
+        require_possible(posed_frames(model.scan, model.poses(), model.unplaced()), model.scan.root)
     _require_pictures(settings, model.scan)
     surface = build_surface(model, settings)
     mesh, scan, poses = surface.marked.mesh, model.scan, model.poses()

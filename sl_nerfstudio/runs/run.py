@@ -3,7 +3,6 @@
 import enum
 import json
 import types
-import warnings
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
@@ -15,13 +14,13 @@ import numpy as np
 import yaml
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
-from sl_nerfstudio.dataparser.dataparser import scan_fingerprint, scan_root
+from sl_nerfstudio.dataparser.dataparser import load_scan, scan_fingerprint, scan_root
 from sl_nerfstudio.errors import UserError, first_line, last_line
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.model.model import SLModelConfig
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.outputs import TrainedModel
-from sl_nerfstudio.model.pipeline import SLPipelineConfig, require_together
+from sl_nerfstudio.model.pipeline import SLPipeline, SLPipelineConfig, require_together
 from sl_nerfstudio.model.run_files import Checkpoint, checkpoints_in, read_checkpoint, settings_fingerprint
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from sl_nerfstudio.parallel import DeviceName, usable_device
@@ -89,15 +88,9 @@ def _reason(error: Exception) -> str:
 class _NotExpected(Exception):
     """A tag, a setting or a value that no configuration of this package has."""
 
-    def __init__(self, node: yaml.Node, problem: str) -> None:
-        self.line, self.problem = node.start_mark.line + 1, problem
-        self.earlier = False  # whether it is a class or a setting that this package no longer has
-
-
-def _no_longer(node: yaml.Node, problem: str) -> _NotExpected:
-    found = _NotExpected(node, problem)
-    found.earlier = True
-    return found
+    def __init__(self, node: yaml.Node, problem: str, earlier: bool = False) -> None:
+        """`earlier`: it is a class or a setting that this package no longer has."""
+        self.line, self.problem, self.earlier = node.start_mark.line + 1, problem, earlier
 
 
 @dataclass(frozen=True)
@@ -156,7 +149,7 @@ class _ConfigLoader(yaml.SafeLoader):
     def settings(self, name: str, node: yaml.Node) -> Any:
         """An instance of an expected class, with exactly its fields and with values of their types."""
         if _is_ours(name) and name not in _expected().settings:
-            raise _no_longer(node, f"there is no class {name} of settings any more")
+            raise _NotExpected(node, f"there is no class {name} of settings any more", earlier=True)
         if name not in _expected().settings or not isinstance(node, yaml.MappingNode):
             raise _NotExpected(node, f"{name} is not a class of settings that is expected here")
         kind = type(_expected().settings[name])
@@ -164,9 +157,7 @@ class _ConfigLoader(yaml.SafeLoader):
         names, hints = [field.name for field in fields(kind)], _hints(name)
         for key, item in node.value:
             if key.value not in names:
-                raise (_no_longer if _is_ours(name) else _NotExpected)(
-                    key, f"{kind.__name__} has no setting {key.value!r}"
-                )
+                raise _NotExpected(key, f"{kind.__name__} has no setting {key.value!r}", earlier=_is_ours(name))
             if not _fits(values[key.value], hints[key.value]):
                 raise _NotExpected(item, f"{values[key.value]!r:.100} is no value for {kind.__name__}.{key.value}")
         missing = [name for name in names if name not in values]
@@ -189,7 +180,7 @@ class _ConfigLoader(yaml.SafeLoader):
     def named(self, name: str, node: yaml.Node) -> type:
         """One of the classes that settings are for."""
         if _is_ours(name) and name not in _expected().targets:
-            raise _no_longer(node, f"there is no class {name} any more")
+            raise _NotExpected(node, f"there is no class {name} any more", earlier=True)
         if name not in _expected().targets:
             raise _NotExpected(node, f"{name} is not a class that is expected here")
         return _expected().targets[name]
@@ -261,11 +252,6 @@ def load_run(config_path: Path | str, data: Path | None = None, device: DeviceNa
     the model is on the GPU if there is one that works.
     Raises UserError for anything missing, broken or made by another method.
     """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, at its import
-        from sl_nerfstudio.dataparser.dataparser import load_scan
-        from sl_nerfstudio.model.pipeline import SLPipeline, require_together
-
     path = config_file(Path(config_path))
     config: Any = read_config(path)
     checkpoint = read_checkpoint(last_checkpoint(config, path))
@@ -277,6 +263,12 @@ def load_run(config_path: Path | str, data: Path | None = None, device: DeviceNa
         )
     require_settings(path, config)
     root = _scan_folder(config, data)
+    if not (root / "transforms.json").is_file():
+        cause = "the path is mistyped" if data else "the scan was moved, renamed or deleted after the training"
+        raise UserError(
+            f"{root}: has no transforms.json, so it is not the scan that the run was trained on\n"
+            f"    cause:  {cause}\n    remedy: give its folder: --data FOLDER"
+        )
     config.pipeline.datamanager.data = root
     device, _ = usable_device(device)
     parser = config.pipeline.datamanager.dataparser
@@ -326,18 +318,8 @@ def last_checkpoint(config: Any, path: Path) -> Path:
     )
 
 
-def _scan_folder(config: Any, data: Path | None) -> Path:
-    from sl_nerfstudio.dataparser.dataparser import scan_root
-
-    stated = data or config.pipeline.datamanager.data or config.pipeline.datamanager.dataparser.data
-    root = scan_root(stated)
-    if not (root / "transforms.json").is_file():
-        cause = "the path is mistyped" if data else "the scan was moved, renamed or deleted after the training"
-        raise UserError(
-            f"{root}: has no transforms.json, so it is not the scan that the run was trained on\n"
-            f"    cause:  {cause}\n    remedy: give its folder: --data FOLDER"
-        )
-    return root
+def _scan_folder(config: Any, data: Path | None = None) -> Path:
+    return scan_root(data or config.pipeline.datamanager.data or config.pipeline.datamanager.dataparser.data)
 
 
 def _require_same_keys(path: Path, stored: Iterable[str], wanted: Iterable[str]) -> None:
@@ -391,7 +373,7 @@ def check_run(path: Path) -> RunCheck:
     Raises UserError, with everything that is wrong once config.yml could be read.
     """
     file = config_file(path)
-    config = read_config(file)
+    config: Any = read_config(file)
     saved = checkpoints_in(last_checkpoint(config, file).parent)
     faults: list[str] = []
     good: list[Checkpoint] = []
@@ -400,26 +382,22 @@ def check_run(path: Path) -> RunCheck:
             good.append(read_checkpoint(checkpoint))
         except UserError as error:
             faults.append(str(error))
-    scan, found = _scan_there(config)
+    scan = _scan_folder(config)
+    there = (scan / "transforms.json").is_file()
+    fingerprint = scan_fingerprint(read_scan(scan)) if there else config.pipeline.scan_fingerprint
     try:
         require_settings(file, config)
         for checkpoint in good:
-            _require_together(config, checkpoint, scan, found)
+            _require_together(config, checkpoint, scan, fingerprint)
     except UserError as error:
         faults.append(str(error))
     if faults:
         raise UserError("\n".join(faults))
-    return RunCheck(file.absolute().parent, config, good[-1], len(saved), scan, found is not None)
+    return RunCheck(file.absolute().parent, config, good[-1], len(saved), scan, there)
 
 
-def _scan_there(config: Any) -> tuple[Path, str | None]:
-    """The scan's folder, and its fingerprint if it is there."""
-    scan = scan_root(config.pipeline.datamanager.data or config.pipeline.datamanager.dataparser.data)
-    return scan, scan_fingerprint(read_scan(scan)) if (scan / "transforms.json").is_file() else None
-
-
-def _require_together(config: Any, checkpoint: Checkpoint, scan: Path, found: str | None) -> None:
+def _require_together(config: Any, checkpoint: Checkpoint, scan: Path, fingerprint: str) -> None:
     try:
-        require_together(config.pipeline, checkpoint.weights, scan, found or config.pipeline.scan_fingerprint)
+        require_together(config.pipeline, checkpoint.weights, scan, fingerprint)
     except UserError as error:
         raise UserError(f"{checkpoint.path}: {error}") from error

@@ -96,6 +96,10 @@ class FacetedScan:
         return lit.reshape(shape), uv.reshape(*shape, 2)
 
 
+MADE = FacetedScan()
+TRUTH = MADE.truth()
+
+
 def first_hit(mesh: Mesh, origin: ndarray, directions: ndarray) -> ndarray:
     """Ray parameter of the first triangle hit, infinity for none (Moeller and Trumbore, all rays and triangles)."""
     a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))

@@ -20,10 +20,6 @@ def bracket() -> Mesh:
     return Mesh(np.concatenate([low, high]), np.concatenate([flat[:, ::-1], flat + 6, sides]).astype(np.int64))
 
 
-def of_trimesh(shape: trimesh.Trimesh) -> Mesh:
-    return Mesh(np.array(shape.vertices, dtype=np.float64), np.array(shape.faces, dtype=np.int64))
-
-
 def scanned(part: Mesh, edge: float = 2.5, noise: float = 0.02, S: Similarity = ANYWHERE, seed: int = 0) -> Mesh:
     """The part with fine triangles, each vertex off by some noise along its normal, anywhere."""
     vertices, faces, *_ = trimesh.remesh.subdivide_to_size(part.vertices, part.faces, edge)

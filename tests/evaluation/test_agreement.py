@@ -20,32 +20,30 @@ from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.scan import read_scan
+from sl_nerfstudio.scan import Frame, Scan, read_scan
 from tests.formulas import rays
 
-from .faceted_scan import FacetedScan
+from .faceted_scan import MADE, TRUTH, FacetedScan
 from .shapes import blob, turn
 
 DOE = Device(w=96, h=80, fl_x=210.0, fl_y=205.0, cx=48.0, cy=41.0, model="DOE")
 
 
-def fit_of(root: Path, mesh: Mesh, poses: DevicePoses | None = None) -> CaptureAgreement:
-    scan = read_scan(root)
+def fit_of(scan: Scan, mesh: Mesh, poses: DevicePoses | None = None) -> CaptureAgreement:
     return evaluate(mesh, scan, poses or scan.poses).agreement
 
 
-@pytest.mark.parametrize(
-    "made",
-    [
-        FacetedScan(),
-        FacetedScan(projector=DOE),
-        FacetedScan(units="m", scale=0.04, offset=(3.0, -2.0, 1.0)),
-        FacetedScan(offset=(5000.0, 2000.0, -3000.0)),
-    ],
-    ids=["pinhole", "DOE", "metres", "far from the origin"],
-)
+SCANS = {
+    "pinhole": MADE,
+    "DOE": FacetedScan(projector=DOE),
+    "metres": FacetedScan(units="m", scale=0.04, offset=(3.0, -2.0, 1.0)),
+    "far from the origin": FacetedScan(offset=(5000.0, 2000.0, -3000.0)),
+}
+
+
+@pytest.mark.parametrize("made", SCANS.values(), ids=SCANS)
 def test_truth_explains_a_clean_scan_perfectly(made: FacetedScan, tmp_path: Path) -> None:
-    fit = fit_of(made.write(tmp_path / "scan"), made.truth())
+    fit = fit_of(read_scan(made.write(tmp_path / "scan")), made.truth())
     assert fit.coordinate_px_median < 1e-3
     assert fit.coordinate_px_p95 < 1e-2
     assert fit.epipolar_px_median < 1e-3
@@ -56,39 +54,26 @@ def test_truth_explains_a_clean_scan_perfectly(made: FacetedScan, tmp_path: Path
         assert frame.lit_share > 0.97 and frame.decoded_share == 1.0
 
 
-def test_a_known_shift_of_the_decoded_coordinates_is_the_residual(clean_scan: Path) -> None:
-    scan = read_scan(clean_scan)
-    frame, made = scan.frames[0], FacetedScan()
-    coords = frame.read_coords()
-    shifted = np.where(np.isfinite(coords), coords + np.float32([0.3, -0.4]), np.nan)
-    path = clean_scan.parent / "shifted.npz"
-    np.savez(path, coords=shifted)
-    from dataclasses import replace
-
-    moved = replace(frame, coords_path=path)
-    pixels = frame_pixels(
-        IndexedMesh(made.truth()), moved, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector
-    )
+def test_a_known_shift_of_the_decoded_coordinates_is_the_residual(scan: Scan, tmp_path: Path) -> None:
+    np.savez(tmp_path / "shifted.npz", coords=scan.frames[0].read_coords() + np.float32([0.3, -0.4]))
+    pixels, _ = pixels_of(scan, TRUTH, replace(scan.frames[0], coords_path=tmp_path / "shifted.npz"))
     np.testing.assert_allclose(np.median(pixels.offset, axis=0), [-0.3, 0.4], atol=1e-3)
     assert np.median(pixels.coordinate) == pytest.approx(0.5, abs=1e-3)
     assert np.nanmax(np.abs(pixels.epipolar)) <= 0.5 + 1e-3  # a shift has a part along the curve, too
 
 
-def test_wrong_relative_pose_shows_in_the_epipolar_residual_whatever_the_mesh(clean_scan: Path) -> None:
-    scan = read_scan(clean_scan)
+def test_wrong_relative_pose_shows_in_the_epipolar_residual_whatever_the_mesh(scan: Scan) -> None:
     projectors = scan.poses.T_world_projector.copy()
     projectors[:, :3, :3] = projectors[:, :3, :3] @ turn((1, 0, 0), 1.0)  # 1 degree is 3.2 pattern pixels
     poses = DevicePoses(scan.poses.T_world_camera, projectors)
-    sphere_fit = fit_of(clean_scan, Mesh(FacetedScan().truth().vertices * 0.8, FacetedScan().truth().faces), poses)
-    true_fit = fit_of(clean_scan, FacetedScan().truth(), poses)
+    small_fit, true_fit = (fit_of(scan, Mesh(TRUTH.vertices * size, TRUTH.faces), poses) for size in (0.8, 1.0))
     assert 1.5 < true_fit.epipolar_px_median < 3.5
-    assert sphere_fit.epipolar_px_median == true_fit.epipolar_px_median
+    assert small_fit.epipolar_px_median == true_fit.epipolar_px_median
     assert true_fit.pattern_cosine < 0.99
 
 
-def test_depth_of_a_pixel_and_ray_angle_follow_from_the_set_up(clean_scan: Path) -> None:
-    fit = fit_of(clean_scan, FacetedScan().truth())
-    true = FacetedScan().true_poses()
+def test_depth_of_a_pixel_and_ray_angle_follow_from_the_set_up(scan: Scan) -> None:
+    fit, true = fit_of(scan, TRUTH), MADE.true_poses()
     centres = (T[:, :3, 3] for T in (true.T_world_camera, true.T_world_projector))
     camera, projector = (c / np.linalg.norm(c, axis=1)[:, None] for c in centres)
     radius = 32.0  # the surface is nearer to the devices than the centre they look at
@@ -103,81 +88,65 @@ def test_look_up_is_bilinear_between_pixel_centres() -> None:
     np.testing.assert_allclose(look_up(image, uv), [0, 1, 0.5, 1.75, 0, np.nan])
 
 
-def test_large_frames_are_thinned_on_a_grid(clean_scan: Path) -> None:
-    scan = read_scan(clean_scan)
-    frame, surface = scan.frames[0], IndexedMesh(FacetedScan().truth())
-    args = (surface, frame, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector)
-    every, few = frame_pixels(*args), frame_pixels(*args, max_pixels=len(frame_pixels(*args).row) // 4 + 1)
+def test_large_frames_are_thinned_on_a_grid(scan: Scan) -> None:
+    every, _ = pixels_of(scan, TRUTH)
+    few, _ = pixels_of(scan, TRUTH, max_pixels=len(every.row) // 4 + 1)
     assert (every.stride, few.stride) == (1, 2)
     assert len(few.row) == pytest.approx(len(every.row) / 4, rel=0.1)
     assert not (few.row % 2).any() and not (few.column % 2).any()
 
 
-def test_many_frames_are_evaluated_at_fewer_pixels_of_each(clean_scan: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_frames_are_evaluated_at_fewer_pixels_of_each(scan: Scan, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [most_pixels(frames) for frames in (1, 120, 1000)] == [MAX_PIXELS, MAX_PIXELS, 30_000]
-    scan, mesh, counts = read_scan(clean_scan), FacetedScan().truth(), []
-    every = evaluate(mesh, scan, scan.poses).agreement
+    every, counts = fit_of(scan, TRUTH), []
     monkeypatch.setattr("sl_nerfstudio.evaluation.agreement._ALL_PIXELS", 1500)
-    few = evaluate(
-        mesh, scan, scan.poses, on_frame=lambda frame, figures, pixels: counts.append(len(pixels.row))
-    ).agreement
+    few = evaluate(TRUTH, scan, scan.poses, on_frame=lambda *one: counts.append(len(one[2].row))).agreement
     assert len(counts) == 3 and all(200 < count <= 550 for count in counts)
     for a, b in zip(every.frames, few.frames, strict=True):
         assert b.pixels == pytest.approx(a.pixels, rel=0.1) and b.hit_share == a.hit_share == 1.0
 
 
-MADE = FacetedScan(mesh=blob(24))
+FINE = FacetedScan(mesh=blob(24))
 
 
 @pytest.fixture(scope="module")
-def fine_scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return MADE.write(tmp_path_factory.mktemp("holes") / "scan")
+def fine_scan(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    return read_scan(FINE.write(tmp_path_factory.mktemp("holes") / "scan"))
 
 
-def pixels_of(root: Path, mesh: Mesh) -> tuple[FramePixels, float]:
-    scan = read_scan(root)
-    frame, surface = scan.frames[0], IndexedMesh(mesh)
-    pixels = frame_pixels(surface, frame, scan, scan.read_pattern(), frame.T_world_camera, frame.T_world_projector)
-    return pixels, surface.diagonal
+def pixels_of(
+    scan: Scan, mesh: Mesh, frame: Frame | None = None, max_pixels: int = MAX_PIXELS
+) -> tuple[FramePixels, float]:
+    """Of the first frame, or another one; and the size of the mesh."""
+    frame, surface = frame or scan.frames[0], IndexedMesh(mesh)
+    T = frame.T_world_camera, frame.T_world_projector
+    return frame_pixels(surface, frame, scan, scan.read_pattern(), *T, max_pixels=max_pixels), surface.diagonal
 
 
-def without(mesh: Mesh, centre: np.ndarray, radius: float) -> tuple[Mesh, np.ndarray]:
-    """The mesh without the triangles around a point, and which ones those were."""
-    lost = np.linalg.norm(mesh.vertices[mesh.faces].mean(1) - centre, axis=1) < radius
-    return Mesh(mesh.vertices, mesh.faces[~lost]), lost
-
-
-def test_the_whole_surface_has_no_holes(fine_scan: Path) -> None:
-    holes = find_holes(*pixels_of(fine_scan, MADE.truth()))
-    assert (holes.missing, holes.largest) == (0.0, 0.0)
+def test_the_whole_surface_has_no_holes(fine_scan: Scan) -> None:
+    assert find_holes(*pixels_of(fine_scan, FINE.truth())) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("radius", [8.0, 14.0])
-def test_a_hole_is_as_large_as_the_pixels_that_saw_what_is_missing(fine_scan: Path, radius: float) -> None:
+def test_a_hole_is_as_large_as_the_pixels_that_saw_what_is_missing(fine_scan: Scan, radius: float) -> None:
     """Rays through the hole meet the back of the object: they hit, but not where the frame measured."""
-    scan, truth = read_scan(fine_scan), MADE.truth()
+    truth, frame = FINE.truth(), fine_scan.frames[0]
     whole, _ = pixels_of(fine_scan, truth)
-    towards = scan.frames[0].T_world_camera[:3, 3]
+    towards = frame.T_world_camera[:3, 3]
     nearest = truth.vertices[np.argmax(truth.vertices @ towards)]
-    mesh, lost = without(truth, nearest, radius)
-    hits = IndexedMesh(truth).cast(*rays_of(fine_scan, whole))
+    lost = np.linalg.norm(truth.vertices[truth.faces].mean(1) - nearest, axis=1) < radius
+    eye, d = rays(frame.camera, frame.T_world_camera, np.stack([whole.column, whole.row], 1) + 0.5)
+    hits = IndexedMesh(truth).cast(np.broadcast_to(eye, d.shape), d)
     expected = float(lost[hits.face[whole.decoded & whole.hit]].sum() / whole.decoded.sum())
-    holes = find_holes(*pixels_of(fine_scan, mesh))
+    missing, largest = find_holes(*pixels_of(fine_scan, truth.with_faces(~lost)))
     assert expected > 0.01
-    assert holes.missing == pytest.approx(expected, rel=0.1)
-    assert 0.6 * expected < holes.largest <= holes.missing
+    assert missing == pytest.approx(expected, rel=0.1)
+    assert 0.6 * expected < largest <= missing
 
 
-def rays_of(root: Path, pixels: FramePixels) -> tuple[np.ndarray, np.ndarray]:
-    """Camera rays by the pinhole's formula."""
-    frame = read_scan(root).frames[0]
-    eye, d = rays(frame.camera, frame.T_world_camera, np.stack([pixels.column, pixels.row], 1) + 0.5)
-    return np.broadcast_to(eye, d.shape), d
-
-
-def test_a_patch_that_was_mistaken_for_another_is_no_hole(fine_scan: Path) -> None:
+def test_a_patch_that_was_mistaken_for_another_is_no_hole(fine_scan: Scan) -> None:
     """Its points lie in the air before the surface, on their epipolar curves, but it has a jump all around it."""
-    pixels, size = pixels_of(fine_scan, MADE.truth())
+    pixels, size = pixels_of(fine_scan, FINE.truth())
     row, column = int(np.median(pixels.row)), int(np.median(pixels.column))
     patch = (np.abs(pixels.row - row) < 3) & (np.abs(pixels.column - column) < 3)
     wrong = replace(
@@ -187,15 +156,14 @@ def test_a_patch_that_was_mistaken_for_another_is_no_hole(fine_scan: Path) -> No
         behind=np.where(patch, 0.2 * size, pixels.behind),
     )
     assert patch.sum() < 0.03 * pixels.decoded.sum()
-    assert find_holes(wrong, size).largest == 0.0
+    assert find_holes(wrong, size)[1] == 0.0
     continuous = replace(wrong, coords=pixels.coords)  # the same without the jump: surface is missing
-    assert find_holes(continuous, size).largest == pytest.approx(patch.sum() / pixels.decoded.sum())
+    assert find_holes(continuous, size)[1] == pytest.approx(patch.sum() / pixels.decoded.sum())
 
 
-def test_narrow_gaps_along_the_rim_and_frames_without_pixels(fine_scan: Path) -> None:
-    pixels, size = pixels_of(fine_scan, MADE.truth())
+def test_narrow_gaps_along_the_rim_and_frames_without_pixels(fine_scan: Scan) -> None:
+    pixels, size = pixels_of(fine_scan, FINE.truth())
     rim = np.array([c == pixels.column[pixels.row == r].min() for r, c in zip(pixels.row, pixels.column, strict=True)])
-    holes = find_holes(replace(pixels, hit=pixels.hit & ~rim), size)
-    assert holes.missing > 0.01 and holes.largest == 0.0
-    nothing = find_holes(replace(pixels, decoded=np.zeros_like(pixels.decoded)), size)
-    assert (nothing.missing, nothing.largest) == (0.0, 0.0)
+    missing, largest = find_holes(replace(pixels, hit=pixels.hit & ~rim), size)
+    assert missing > 0.01 and largest == 0.0
+    assert find_holes(replace(pixels, decoded=np.zeros_like(pixels.decoded)), size) == (0.0, 0.0)

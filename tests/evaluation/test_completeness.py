@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 
 from sl_nerfstudio.evaluation.completeness import (
-    CaptureView,
     NextView,
-    Occluders,
     find_openings,
     information,
     known,
     next_view,
+    occluders,
     places,
 )
-from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
+from sl_nerfstudio.evaluation.mesh_index import CaptureView, IndexedMesh
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
@@ -103,17 +102,17 @@ def test_a_projector_that_stands_still_stays_where_it_is():
 def test_information_follows_from_noise_angle_and_visibility():
     mesh = cut_sphere(-0.4)
     surface, openings = IndexedMesh(mesh), find_openings(mesh)
-    at, occluders = places(surface, openings, 400), Occluders(surface, openings)
+    at, hiding = places(surface, openings, 400), occluders(surface, openings)
     wide, narrow = (poses(np.array([0.0]), 0.6) for _ in range(2))
     narrow.T_world_projector[0] = poses(np.array([-9.0]), 0.6).T_world_projector[0]  # 3 degrees beside the camera
     views = [CaptureView(DEVICE, p.T_world_camera[0], DEVICE, p.T_world_projector[0]) for p in (wide, narrow)]
-    one, coarse = information(at, occluders, views[0], 0.3), information(at, occluders, views[0], 0.6)
+    one, coarse = information(at, hiding, views[0], 0.3), information(at, hiding, views[0], 0.6)
     np.testing.assert_allclose(one, 4 * coarse)  # variance is the square of the noise
-    flat = information(at, occluders, views[1], 0.3)
+    flat = information(at, hiding, views[1], 0.3)
     both = (one > 0) & (flat > 0)
     assert both.sum() > 50 and np.median(one[both] / flat[both]) == pytest.approx(16, rel=0.2)  # (12 / 3)^2
     facing = (at.normals * views[0].T_world_camera[:3, 2]).sum(1)
     assert (one[facing < 0] == 0).all() and (one[at.opening >= 0] == 0).all()  # the opening looks down
-    total = known(at, occluders, views, 0.3)
+    total = known(at, hiding, views, 0.3)
     np.testing.assert_allclose(total, one + flat + 1 / at.doubt**2)
     assert at.area.sum() == pytest.approx(surface.area + openings.area.sum(), rel=1e-6)

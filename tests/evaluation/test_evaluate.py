@@ -30,24 +30,27 @@ from sl_nerfstudio.meshing.uncertainty import point_changes, views_by_frame
 from sl_nerfstudio.scan import Scan, read_scan
 from tests import formulas
 
-from .faceted_scan import FacetedScan
+from .faceted_scan import CAMERA, MADE, PROJECTOR, TRUTH, FacetedScan
 from .shapes import blob, known_similarity, sphere, turn
 
 SAMPLES = 5000
 
 
-def evaluated(root: Path, mesh: Mesh, made: FacetedScan, poses: DevicePoses | None = None) -> Evaluation:
-    scan, true = read_scan(root), made.true_poses()
+def evaluated(scan: Scan, mesh: Mesh, made: FacetedScan = MADE, poses: DevicePoses | None = None) -> Evaluation:
+    true = made.true_poses()
     reference = mesh_reference(made.truth(), scan, true, SAMPLES)
-    start = scan.poses
-    return evaluate(mesh, scan, poses or start, reference, true, samples=SAMPLES)
+    return evaluate(mesh, scan, poses or scan.poses, reference, true, samples=SAMPLES)
 
 
-def test_a_result_in_another_gauge_is_perfect_once_aligned(clean_scan: Path) -> None:
-    """The whole result, mesh and poses, lies far away, turned by 100 degrees and 3 % too large."""
-    made = FacetedScan()
-    S = Similarity(1.03, turn((0.2, 1.0, -0.4), 100.0), np.array([300.0, -80.0, 40.0]))
-    result = evaluated(clean_scan, made.truth().mapped(S), made, made.true_poses().mapped(S))
+def elsewhere(scale: float) -> Similarity:
+    """Far away, turned by 100 degrees and of another size."""
+    return Similarity(scale, turn((0.2, 1.0, -0.4), 100.0), np.array([300.0, -80.0, 40.0]))
+
+
+def test_a_result_in_another_gauge_is_perfect_once_aligned(scan: Scan) -> None:
+    """The whole result, mesh and poses, lies elsewhere and is 3 % too large."""
+    S = elsewhere(1.03)
+    result = evaluated(scan, TRUTH.mapped(S), poses=MADE.true_poses().mapped(S))
     similarity, rigid = result.surface["similarity"], result.surface["rigid"]
     assert similarity.scale == pytest.approx(1 / 1.03, rel=1e-6)
     assert similarity.accuracy.p95 < 1e-3 and similarity.completeness.p95 < 1e-3
@@ -61,13 +64,10 @@ def test_a_result_in_another_gauge_is_perfect_once_aligned(clean_scan: Path) -> 
     assert result.agreement.coordinate_px_median < 1e-2
 
 
-def test_reference_points_in_the_scans_world_are_found_from_a_result_of_another_gauge(clean_scan: Path) -> None:
+def test_reference_points_in_the_scans_world_are_found_from_a_result_of_another_gauge(scan: Scan) -> None:
     """No true poses: the scan's own ones lead to the reference, though the result is 60 times smaller and far away."""
-    made, scan = FacetedScan(), read_scan(clean_scan)
-    S = Similarity(1 / 60, turn((0.2, 1.0, -0.4), 100.0), np.array([300.0, -80.0, 40.0]))
-    points = IndexedMesh(made.truth()).sample(SAMPLES, 3)[0]
-    poses = scan.poses.mapped(S)
-    result = evaluate(made.truth().mapped(S), scan, poses, PointReference(points, "points"), samples=SAMPLES)
+    S, points = elsewhere(1 / 60), PointReference(IndexedMesh(TRUTH).sample(SAMPLES, 3)[0], "points")
+    result = evaluate(TRUTH.mapped(S), scan, scan.poses.mapped(S), points, samples=SAMPLES)
     assert result.surface["similarity"].scale == pytest.approx(60, rel=1e-3)
     assert result.surface["similarity"].accuracy.p95 < 2.5  # distances between 5,000 points on 100 mm
     assert result.pose_errors is None
@@ -77,8 +77,9 @@ def as_json(evaluation: Evaluation) -> dict:
     return to_json(evaluation, judge(evaluation).verdict)
 
 
-def test_json_has_what_the_command_promises(clean_scan: Path) -> None:
-    content = as_json(evaluated(clean_scan, FacetedScan().truth(), FacetedScan()))
+def test_json_has_what_the_command_promises_and_repeats_with_the_seed(scan: Scan) -> None:
+    content, again = (as_json(evaluated(scan, TRUTH)) for _ in range(2))
+    assert content == again
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     assert content["units"] == content["truth_units"] == "mm"
     for name in ("rigid", "similarity", "none"):
@@ -96,40 +97,27 @@ def test_json_has_what_the_command_promises(clean_scan: Path) -> None:
     assert len(content["cross_frame"]["frames"]) == 3
 
 
-def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(clean_scan: Path) -> None:
+def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(scan: Scan) -> None:
     """A result that is 60 times too small and off by 1 % of its size: by half a millimetre, says the truth."""
-    made, scan = FacetedScan(), replace(read_scan(clean_scan), units="arbitrary")
-    S = Similarity(1 / 60, np.eye(3), np.zeros(3))
-    vertices = made.truth().vertices
-    poses = scan.poses.mapped(S)
-    noisy = Mesh(vertices + np.random.default_rng(0).normal(0, 0.5, vertices.shape), made.truth().faces)
-    reference = mesh_reference(made.truth(), scan, made.true_poses(), SAMPLES)
-    evaluation = evaluate(noisy.mapped(S), scan, poses, reference, made.true_poses(), samples=SAMPLES)
-    assert list(evaluation.comparable) == [
-        "similarity"
-    ]  # a person is not shown distances of 60 times too small a thing
+    S, noise = Similarity.scaling(1 / 60), np.random.default_rng(0).normal(0, 0.5, TRUTH.vertices.shape)
+    noisy = Mesh(TRUTH.vertices + noise, TRUTH.faces).mapped(S)
+    evaluation = evaluated(replace(scan, units="arbitrary"), noisy, poses=scan.poses.mapped(S))
+    assert list(evaluation.comparable) == ["similarity"]  # nobody is shown distances of 60 times too small a thing
     content = as_json(evaluation)
     assert (content["units"], content["truth_units"]) == ("arbitrary", "units of the truth")
     assert 0.1 < content["similarity"]["accuracy"]["rmse"] < 1.0
     assert content["camera"]["translation_rmse"] < 1e-6
 
 
-def test_without_truth_only_the_fit_is_there(clean_scan: Path) -> None:
-    scan = read_scan(clean_scan)
-    content = as_json(evaluate(FacetedScan().truth(), scan, scan.poses))
+def test_without_truth_only_the_fit_is_there(scan: Scan) -> None:
+    content = as_json(evaluate(TRUTH, scan, scan.poses))
     assert set(content) == {"format", "verdict", "reasons", "units", "fit", "coverage", "cross_frame"}
     assert content["fit"]["coordinate_px_median"] < 1e-3
 
 
-def test_figures_repeat_with_the_seed(clean_scan: Path) -> None:
-    first, second = (as_json(evaluated(clean_scan, FacetedScan().truth(), FacetedScan())) for _ in range(2))
-    assert first == second
-
-
 def test_initial_pose_errors_are_those_that_were_put_in(tmp_path: Path) -> None:
     made = FacetedScan(frames=6, wrong_poses_deg=2.0)
-    root = made.write(tmp_path / "scan")
-    result = evaluated(root, made.truth(), made)
+    result = evaluated(read_scan(made.write(tmp_path / "scan")), made.truth(), made)
     assert result.pose_errors is not None
     assert result.initial_pose_errors is None  # the starting poses are the evaluated ones
     assert result.starting_poses
@@ -140,9 +128,9 @@ def test_initial_pose_errors_are_those_that_were_put_in(tmp_path: Path) -> None:
 def test_figures_do_not_depend_on_the_unit(tmp_path: Path) -> None:
     in_mm = FacetedScan(wrong_poses_deg=1.0)
     in_m = FacetedScan(wrong_poses_deg=1.0, units="m", scale=0.04)
-    swollen = Mesh(in_mm.mesh.vertices * 1.02, in_mm.mesh.faces)
+    swollen = Similarity.scaling(1.02)
     mm, m = (
-        as_json(evaluated(made.write(tmp_path / made.units), FacetedScan(scale=made.scale, mesh=swollen).truth(), made))
+        as_json(evaluated(read_scan(made.write(tmp_path / made.units)), made.truth().mapped(swollen), made))
         for made in (in_mm, in_m)
     )
     assert m["rigid"]["accuracy"]["rmse"] * 1000 == pytest.approx(mm["rigid"]["accuracy"]["rmse"], rel=1e-4)
@@ -151,19 +139,15 @@ def test_figures_do_not_depend_on_the_unit(tmp_path: Path) -> None:
     assert m["fit"]["coordinate_px_median"] == pytest.approx(mm["fit"]["coordinate_px_median"], rel=1e-3)
 
 
-def test_mesh_in_another_unit_is_refused_with_the_sizes(clean_scan: Path) -> None:
-    scan = read_scan(clean_scan)
-    far = Mesh(FacetedScan().truth().vertices / 1000 + 500.0, FacetedScan().truth().faces)
-    with pytest.raises(
-        UserError, match=r"no camera ray .* hits the mesh\n.*mesh measures 0\.1\d*, and the cameras are .* away .*mm"
-    ) as error:
+def test_mesh_in_another_unit_is_refused_with_the_sizes(scan: Scan) -> None:
+    far = Mesh(TRUTH.vertices / 1000 + 500.0, TRUTH.faces)
+    said = r"no camera ray .* hits the mesh\n.*mesh measures 0\.1\d*, and the cameras are .* away .*mm"
+    with pytest.raises(UserError, match=rf"{said}[\s\S]*remedy: give the mesh that was exported from this scan"):
         evaluate(far, scan, scan.poses)
-    assert "remedy: give the mesh that was exported from this scan" in str(error.value)
 
 
-def test_reference_inside_out_is_refused(clean_scan: Path) -> None:
-    scan, truth = read_scan(clean_scan), FacetedScan().truth()
-    turned = Mesh(truth.vertices, truth.faces[:, ::-1].copy())
+def test_reference_inside_out_is_refused(scan: Scan) -> None:
+    turned = Mesh(TRUTH.vertices, TRUTH.faces[:, ::-1].copy())
     with pytest.raises(UserError, match="inside out"):
         mesh_reference(turned, scan, scan.poses, SAMPLES)
 
@@ -188,9 +172,8 @@ def test_half_of_a_truth_missing_leaves_accuracy_and_halves_recall() -> None:
     truth = sphere(10.0, 100)
     half = truth.with_faces(truth.vertices[truth.faces].mean(1)[:, 2] > 0)
     result = IndexedMesh(half)
-    score = score_surface(
-        result, result.sample(20_000, 0)[0], whole(IndexedMesh(truth)), Similarity.identity(), (0.01,)
-    )
+    samples = result.sample(20_000, 0)[0]
+    score = score_surface(result, samples, whole(IndexedMesh(truth)), Similarity.identity(), (0.01,))
     assert score.accuracy.p95 < 1e-6
     assert score.completeness.p95 > 5
     assert score.f_score[0.01] == pytest.approx(2 / 3, abs=0.01)  # precision 1, recall 1/2
@@ -211,10 +194,8 @@ def test_reference_points_are_compared_and_aligned_too() -> None:
 
 
 def test_signed_distance_is_negative_inside() -> None:
-    reference = whole(IndexedMesh(sphere(10.0, 100)))
-    np.testing.assert_allclose(
-        reference.surface.signed_distance(np.array([[0, 0, 11.0], [0, 0, 9.0], [9.5, 0, 0]])), [1, -1, -0.5], atol=0.01
-    )
+    found = IndexedMesh(sphere(10.0, 100)).signed_distance(np.array([[0, 0, 11.0], [0, 0, 9.0], [9.5, 0, 0]]))
+    np.testing.assert_allclose(found, [1, -1, -0.5], atol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -234,33 +215,24 @@ FRAMES = 3
 
 
 @pytest.fixture(scope="module")
-def scan(clean_scan: Path) -> Scan:
-    return read_scan(clean_scan)
-
-
-@pytest.fixture(scope="module")
 def rows(scan: Scan) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices that frames confirm, the derivatives of those points, and the frames that confirm each."""
-    mesh = FacetedScan().truth()
-    every = list(views_by_frame(mesh, scan, scan.poses, None, "test"))
+    every = list(views_by_frame(TRUTH, scan, scan.poses, None, "test"))
     chosen = np.unique(np.concatenate([view.vertex for view in every]))
     seen = np.stack([np.isin(chosen, view.vertex) for view in every], 1)
-    return chosen, point_changes(mesh, scan, scan.poses, every, chosen, np.eye(12 * FRAMES + 6)), seen
+    return chosen, point_changes(TRUTH, scan, scan.poses, every, chosen, np.eye(12 * FRAMES + 6)), seen
 
 
 def quality() -> VertexQuality:
-    count = len(FacetedScan().truth().vertices)
-    views = np.full(count, 2)
-    return VertexQuality(np.full(count, 0.05), np.full(count, 0.03), views, np.zeros(count), np.zeros(count))
+    count = len(TRUTH.vertices)
+    return VertexQuality(*(np.full(count, value) for value in (0.05, 0.03, 2, 0.0, 0.0)))
 
 
 def test_a_point_is_where_the_rays_of_all_its_pixels_meet_best(scan, rows):
     """With disturbed poses, least squares on the plain pinhole formulas, from the pixels under the true ones."""
-    from .faceted_scan import CAMERA, PROJECTOR
-
     chosen, found, seen = rows
     row = int(seen.sum(1).argmax())
-    p, frames = FacetedScan().truth().vertices[chosen[row]], np.flatnonzero(seen[row])
+    p, frames = TRUTH.vertices[chosen[row]], np.flatnonzero(seen[row])
     step = np.random.default_rng(0).normal(size=(2, FRAMES, 6)) * ([1e-3] * 3 + [1e-5] * 3)
 
     def pixels(at: np.ndarray, sign: float) -> np.ndarray:
@@ -286,41 +258,39 @@ def test_a_point_is_where_the_rays_of_all_its_pixels_meet_best(scan, rows):
 
 def test_a_length_has_the_uncertainty_of_its_ends(scan, rows):
     chosen, found, _ = rows
-    mesh = FacetedScan().truth()
-    a, b = int(chosen[0]), int(chosen[-1])
-    pair = PointPair("edge", tuple(mesh.vertices[a].tolist()), tuple(mesh.vertices[b].tolist()))
-    factor = np.random.default_rng(1).normal(size=(12 * FRAMES + 6,) * 2) * 1e-3
-    joint = JointCovariance(factor)
-    (length,) = measure_lengths([pair], mesh, quality(), scan, scan.poses, joint)
-    u = mesh.vertices[b] - mesh.vertices[a]
+    ends = TRUTH.vertices[chosen[[0, -1]]]
+    pair = PointPair("edge", *map(tuple, ends.tolist()))
+    joint = JointCovariance(np.random.default_rng(1).normal(size=(12 * FRAMES + 6,) * 2) * 1e-3)
+    (length,) = measure_lengths([pair], TRUTH, quality(), scan, scan.poses, joint)
+    u = ends[1] - ends[0]
     assert length.length == pytest.approx(np.linalg.norm(u), rel=1e-6)
     u = u / np.linalg.norm(u)
     row = u @ (found[-1] - found[0])
     assert length.sigma_shared == pytest.approx(np.sqrt(row @ joint.matrix @ row), rel=1e-9)
-    independent = 0.03 * np.hypot(*(mesh.vertex_normals()[[a, b]] @ u))
+    independent = 0.03 * np.hypot(*(TRUTH.vertex_normals()[chosen[[0, -1]]] @ u))
     assert length.sigma_independent == pytest.approx(independent, rel=1e-9)
     assert length.sigma == pytest.approx(np.hypot(length.sigma_shared, independent)) and length.views == (2, 2)
     rigid = np.r_[np.tile([1.0, 2, 3, 0.1, 0.2, 0.3], FRAMES), np.zeros(6 * FRAMES + 6)]
-    (still,) = measure_lengths([pair], mesh, quality(), scan, scan.poses, JointCovariance(rigid[:, None]))
+    (still,) = measure_lengths([pair], TRUTH, quality(), scan, scan.poses, JointCovariance(rigid[:, None]))
     assert still.sigma_shared == pytest.approx(0, abs=1e-5)
     for known in ((None, joint), (quality(), None)):
-        (unknown,) = measure_lengths([pair], mesh, known[0], scan, scan.poses, known[1])
+        (unknown,) = measure_lengths([pair], TRUTH, known[0], scan, scan.poses, known[1])
         assert unknown.sigma is None and unknown.length == length.length
 
 
 def test_what_is_typical_of_lengths_is_their_growth(scan):
     """If all poses grow by a common, unknown factor, every length is as uncertain as the factor."""
-    mesh, known = FacetedScan().truth(), quality()
+    known = quality()
     growth = np.zeros((2, FRAMES, 6))
     growth[0, :, :3] = scan.poses.T_world_camera[:, :3, 3]
     growth[1, :, :3] = scan.poses.T_camera_projector[:, :3, 3]
     step = 0.01 * np.r_[growth.ravel(), np.zeros(6)]
-    exact = replace(known, sigma_independent=np.zeros(len(mesh.vertices)))
+    exact = replace(known, sigma_independent=np.zeros(len(TRUTH.vertices)))
     joint = JointCovariance(step[:, None])
-    assert typical_sigma(mesh, exact, scan, scan.poses, joint) == pytest.approx(0.01, rel=1e-6)
+    assert typical_sigma(TRUTH, exact, scan, scan.poses, joint) == pytest.approx(0.01, rel=1e-6)
     unseen = replace(known, views=np.zeros_like(known.views))
     for quality_, joint_ in ((None, joint), (known, None), (unseen, joint)):
-        assert typical_sigma(mesh, quality_, scan, scan.poses, joint_) is None
+        assert typical_sigma(TRUTH, quality_, scan, scan.poses, joint_) is None
 
 
 def test_pairs_are_read_as_they_are_written(tmp_path):
@@ -343,9 +313,8 @@ def test_pairs_are_read_as_they_are_written(tmp_path):
 
 
 def test_points_beside_the_mesh_are_refused(scan):
-    mesh = FacetedScan().truth()
-    a = tuple(mesh.vertices[0].tolist())
+    a = tuple(TRUTH.vertices[0].tolist())
     with pytest.raises(UserError, match=r"500,0,0 is .* away from the surface \(unit: mm\)\n    cause:"):
-        measure_lengths([PointPair("far", a, (500.0, 0.0, 0.0))], mesh, None, scan, scan.poses, None)
+        measure_lengths([PointPair("far", a, (500.0, 0.0, 0.0))], TRUTH, None, scan, scan.poses, None)
     with pytest.raises(UserError, match="both points are the same"):
-        measure_lengths([PointPair("none", a, a)], mesh, None, scan, scan.poses, None)
+        measure_lengths([PointPair("none", a, a)], TRUTH, None, scan, scan.poses, None)

@@ -36,9 +36,8 @@ def test_good_agreement_is_good_and_needs_nothing() -> None:
 
 
 def test_what_is_wrong_with_the_intrinsics_comes_first() -> None:
-    poor = judge(
-        replace(GOOD, starting_poses=False, agreement=replace(AGREEMENT, hit_share=0.5)), "The camera is too long"
-    )
+    lacking = replace(GOOD, starting_poses=False, agreement=replace(AGREEMENT, hit_share=0.5))
+    poor = judge(lacking, "The camera is too long")
     assert poor.next_steps == ["The camera is too long"] and poor.verdict.reasons[0].startswith("Coverage")
     assert judge(GOOD, "The camera is too long").next_steps == ["The camera is too long"]
 
@@ -111,15 +110,10 @@ def test_the_worst_figure_decides_and_says_what_to_do(change: dict, check: str, 
         assert "frame_00007" in verdict.verdict.reasons[0] and "frame_00007" in judged[check].text
 
 
-TRAIN, EXPORT = ["ns-train", "sl-neus", "--data", "my scan"], ["sl-export", "--resolution", "1024"]
-
-
 @pytest.mark.parametrize(("step", "train"), [(9, True), (999, False), (1500, False)])
 def test_only_an_unfinished_training_is_to_be_trained_further_and_with_a_command(step: int, train: bool) -> None:
-    training = {
-        "settings": {"step": step, "recommended_steps": 1000},
-        "commands": {"train": TRAIN, "export": EXPORT},
-    }
+    commands = {"train": ["ns-train", "sl-neus", "--data", "my scan"], "export": ["sl-export", "--resolution", "1024"]}
+    training = {"settings": {"step": step, "recommended_steps": 1000}, "commands": commands}
     lacking = replace(GOOD, agreement=replace(AGREEMENT, hit_share=0.5, coordinate_px_median=3.0))
     found = judge(lacking, steps=trained_steps(training), commands=further_commands(training)).verdict.reasons
     said = "train to the end: ns-train sl-neus --data 'my scan'"

@@ -12,6 +12,7 @@ from sl_nerfstudio.evaluation.mesh_faults import find_mesh_faults
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import read_scan
+from tests.meshing.solids import together
 
 from .faceted_scan import FacetedScan
 from .shapes import blob, sphere
@@ -30,8 +31,7 @@ def flipped(mesh: Mesh, chosen: np.ndarray) -> Mesh:
 
 def with_piece(mesh: Mesh, at: tuple[float, float, float], size: float) -> Mesh:
     other = sphere(size / 2, 6)
-    vertices = np.concatenate([mesh.vertices, other.vertices + np.array(at)])
-    return Mesh(vertices, np.concatenate([mesh.faces, other.faces + len(mesh.vertices)]))
+    return together(mesh, Mesh(other.vertices + np.array(at), other.faces))
 
 
 def faults(case, mesh: Mesh):

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from sl_nerfstudio.evaluation.mesh_index import IndexedMesh, nearest_on_triangle, observable
+from sl_nerfstudio.evaluation.mesh_index import CaptureView, IndexedMesh, nearest_on_triangle, observable
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
+from tests.meshing.solids import together
 
 from .faceted_scan import looking_at_origin
 from .shapes import sphere
@@ -29,9 +30,7 @@ def test_distance_is_to_the_triangles_not_to_their_corners_in_any_unit_and_anywh
 def test_samples_are_spread_evenly_by_area_and_repeat_with_the_seed() -> None:
     small = square(0.0, 1.0)
     large = square(5.0, 3.0)  # nine times the area, the same number of triangles
-    surface = IndexedMesh(
-        Mesh(np.concatenate([small.vertices, large.vertices]), np.concatenate([small.faces, large.faces + 4]))
-    )
+    surface = IndexedMesh(together(small, large))
     points, normals = surface.sample(20_000, seed=3)
     assert surface.area == pytest.approx(4 + 36)
     assert (points[:, 2] == 0).sum() == pytest.approx(2000, abs=2)  # stratified: exact up to a point at each end
@@ -101,11 +100,15 @@ def test_points_on_the_long_thin_triangles_of_a_cylinder_have_distance_zero() ->
 DEVICE = Device(w=100, h=100, fl_x=400.0, fl_y=400.0, cx=50.0, cy=50.0)
 
 
+def view(T_camera: np.ndarray, T_projector: np.ndarray) -> CaptureView:
+    return CaptureView(DEVICE, T_camera, DEVICE, T_projector)
+
+
 def test_of_a_sphere_exactly_what_faces_both_devices_is_observable() -> None:
     surface = IndexedMesh(sphere(10.0, 120))
     points, normals = surface.sample(4000, 0)
     camera, projector = looking_at_origin(400.0, 0.0, 0.0), looking_at_origin(500.0, 1.0, 0.0)
-    seen = observable(points, normals, surface, [(DEVICE, camera, DEVICE, projector)])
+    seen = observable(points, normals, surface, [view(camera, projector)])
     heights = [(T[:3, 3] - points) @ np.eye(3) for T in (camera, projector)]
     cosines = np.array([(h * points / 10).sum(1) / np.linalg.norm(h, axis=1) for h in heights])
     clear = np.abs(cosines).min(0) > 0.05
@@ -116,9 +119,9 @@ def test_frames_add_up_but_camera_and_projector_must_belong_to_one_frame() -> No
     surface = IndexedMesh(sphere(10.0, 60))
     points, normals = surface.sample(2000, 0)
     front, back = looking_at_origin(400.0, 0.0, 0.0), looking_at_origin(400.0, np.pi, 0.0)
-    both_front = observable(points, normals, surface, [(DEVICE, front, DEVICE, front)])
-    everything = observable(points, normals, surface, [(DEVICE, front, DEVICE, front), (DEVICE, back, DEVICE, back)])
-    never = observable(points, normals, surface, [(DEVICE, front, DEVICE, back)])
+    both_front = observable(points, normals, surface, [view(front, front)])
+    everything = observable(points, normals, surface, [view(front, front), view(back, back)])
+    never = observable(points, normals, surface, [view(front, back)])
     assert 0.4 < both_front.mean() < 0.5
     assert everything.mean() > 0.9
     assert not never.any()
@@ -127,15 +130,10 @@ def test_frames_add_up_but_camera_and_projector_must_belong_to_one_frame() -> No
 def test_what_is_hidden_or_out_of_the_picture_is_not_observed() -> None:
     ball = sphere(10.0, 60)
     shield = np.array([[30.0, -50, -50], [30.0, 50, -50], [30.0, 0, 80]])  # between the ball and the devices at +x
-    both = IndexedMesh(
-        Mesh(
-            np.concatenate([ball.vertices, shield]),
-            np.concatenate([ball.faces, [[0, 1, 2] + np.array(len(ball.vertices))]]),
-        )
-    )
+    both = IndexedMesh(together(ball, Mesh(shield, np.array([[0, 1, 2]]))))
     points, normals = IndexedMesh(ball).sample(500, 0)
     T = looking_at_origin(400.0, 0.0, 0.0)
-    assert not observable(points, normals, both, [(DEVICE, T, DEVICE, T)]).any()
+    assert not observable(points, normals, both, [view(T, T)]).any()
     aside = T.copy()
     aside[:3, 3] += 200 * T[:3, 0]
-    assert not observable(points, normals, IndexedMesh(ball), [(DEVICE, T, DEVICE, aside)]).any()
+    assert not observable(points, normals, IndexedMesh(ball), [view(T, aside)]).any()

@@ -9,6 +9,7 @@ from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import align_poses, compare_poses, icp
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
+from tests.meshing.solids import together
 
 from .shapes import blob, known_similarity, turn
 
@@ -29,12 +30,7 @@ def assert_same(found: Similarity, expected: Similarity, tolerance: float) -> No
 
 
 @settings(max_examples=20)
-@given(
-    count=st.integers(2, 8),
-    degrees=st.floats(0, 179),
-    scale=st.floats(0.2, 5.0),
-    seed=st.integers(0, 1000),
-)
+@given(count=st.integers(2, 8), degrees=st.floats(0, 179), scale=st.floats(0.2, 5.0), seed=st.integers(0, 1000))
 def test_poses_moved_by_a_similarity_come_back(count: int, degrees: float, scale: float, seed: int) -> None:
     true = random_poses(count, seed)
     S = Similarity(scale, turn((0.3, -1.0, 0.7), degrees), np.array([10.0, -20.0, 5.0]))
@@ -65,10 +61,7 @@ def test_icp_brings_a_moved_mesh_back(with_scale: bool) -> None:
 def test_icp_ignores_invented_surface() -> None:
     truth = IndexedMesh(blob())
     plate = np.array([[-1.0, -1.0, 2.0], [1.0, -1.0, 2.0], [0.0, 1.0, 2.0]])
-    both = Mesh(
-        np.concatenate([blob().vertices, plate]),
-        np.concatenate([blob().faces, [[0, 1, 2] + np.array(len(blob().vertices))]]),
-    )
+    both = together(blob(), Mesh(plate, np.array([[0, 1, 2]])))
     S = known_similarity()
     found = icp(IndexedMesh(both.mapped(S.inverse())).sample(6000, 0)[0], truth, Similarity.identity(), True)
     assert_same(found.S_target_source, S, 1e-6)

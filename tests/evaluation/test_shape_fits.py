@@ -9,13 +9,14 @@ from sl_nerfstudio.evaluation.shape_fits import FittedShape, fit_shape, parse_re
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.uncertainty import Smoothing
+from tests.meshing.solids import mesh_of
 
-from .parts import of_trimesh, scanned
+from .parts import scanned
 
 HERE = Similarity.identity()
-CYLINDER = scanned(of_trimesh(trimesh.creation.cylinder(15, 50, sections=200)), edge=1.5, noise=0.0, S=HERE)
-SPHERE = of_trimesh(trimesh.creation.icosphere(5, 20))
-PLANE = scanned(of_trimesh(trimesh.creation.box((60, 40, 25))), edge=1.5, noise=0.0, S=HERE)
+CYLINDER = scanned(mesh_of(trimesh.creation.cylinder(15, 50, sections=200)), edge=1.5, noise=0.0, S=HERE)
+SPHERE = mesh_of(trimesh.creation.icosphere(5, 20))
+PLANE = scanned(mesh_of(trimesh.creation.box((60, 40, 25))), edge=1.5, noise=0.0, S=HERE)
 CASES = {"cylinder 15,0,0 12": (CYLINDER, 15), "sphere 20,0,0 12": (SPHERE, 20), "plane 0,0,12.5 12": (PLANE, None)}
 
 

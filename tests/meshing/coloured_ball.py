@@ -8,16 +8,15 @@ import numpy as np
 import trimesh
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.scan.images import encode_png
 from tests.formulas import on_ball, rays
 
 from .ray_cast_scan import pairs_around, scan_of
+from .solids import mesh_of
 
 RADIUS = 40.0
-SOLID = trimesh.creation.icosphere(4, RADIUS)
-BALL = Mesh(np.asarray(SOLID.vertices, dtype=np.float64), np.asarray(SOLID.faces, dtype=np.int64))
+BALL = mesh_of(trimesh.creation.icosphere(4, RADIUS))
 PINHOLE = Device(w=128, h=112, fl_x=300.0, fl_y=310.0, cx=60.0, cy=58.0)
 Colour = Callable[[np.ndarray], np.ndarray]
 

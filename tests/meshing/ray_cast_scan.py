@@ -34,32 +34,19 @@ def scan_of(
     truth: Mesh, poses: list[tuple[ndarray, ndarray]], root: Path, change: Change | None = None, camera: Device = CAMERA
 ) -> Scan:
     """Write noise-free captures of `truth`, passed through `change(frame number, coords)`, and give them as a Scan."""
-    images = np.zeros((camera.h, camera.w), dtype=np.uint8)
-    pattern = np.zeros((PROJECTOR.h, PROJECTOR.w), dtype=np.uint8)
-    frames = []
-    with ScanWriter(
-        root, units="mm", scale=Scale(True, "test"), projector=PROJECTOR, pattern=pattern, camera=camera
-    ) as writer:
+    image, pattern = (np.zeros((device.h, device.w), dtype=np.uint8) for device in (camera, PROJECTOR))
+    devices = {"projector": PROJECTOR, "pattern": pattern, "camera": camera}
+    scale, frames = Scale(True, "test"), []
+    with ScanWriter(root, units="mm", scale=scale, **devices) as writer:
         for number, (T_camera, T_projector) in enumerate(poses):
             coords, mask = captured(truth, camera, T_camera, T_projector)
             coords = coords if change is None else change(number, coords)
-            name = f"frame_{number:05d}"
-            writer.add_frame(
-                name, image=images, coords=coords, mask=mask, T_world_camera=T_camera, T_world_projector=T_projector
-            )
-            frames.append(
-                Frame(
-                    name,
-                    camera,
-                    root / f"images/{name}.png",
-                    None,
-                    root / f"coords/{name}.npz",
-                    root / f"masks/{name}.png",
-                    T_camera,
-                    T_projector,
-                )
-            )
-    return Scan(root, "mm", Scale(True, "test"), PROJECTOR, root / "pattern.png", tuple(frames))
+            name, T = f"frame_{number:05d}", {"T_world_camera": T_camera, "T_world_projector": T_projector}
+            writer.add_frame(name, image=image, coords=coords, mask=mask, **T)
+            kinds = ("images", "png"), ("coords", "npz"), ("masks", "png")
+            image_path, coords_path, mask_path = (root / f"{folder}/{name}.{ending}" for folder, ending in kinds)
+            frames.append(Frame(name, camera, image_path, None, coords_path, mask_path, **T))
+    return Scan(root, "mm", scale, PROJECTOR, root / "pattern.png", tuple(frames))
 
 
 def captured(

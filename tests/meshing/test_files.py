@@ -23,10 +23,10 @@ from sl_nerfstudio.meshing.files import (
 )
 from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties, VertexQuality
 
-SOLID = trimesh.creation.icosphere(subdivisions=2)
-MESH = Mesh(
-    np.asarray(SOLID.vertices, dtype=np.float64) * 40 + [100.0, -20.0, 3.0], np.asarray(SOLID.faces, dtype=np.int64)
-)
+from .solids import mesh_of
+
+BALL = mesh_of(trimesh.creation.icosphere(subdivisions=2), 40.0)
+MESH = Mesh(BALL.vertices + [100.0, -20.0, 3.0], BALL.faces)
 EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64))
 
 
@@ -135,9 +135,8 @@ def test_contents_that_are_no_mesh(suffix, content, message, tmp_path):
 def test_polygons_and_several_parts_are_read(tmp_path):
     (tmp_path / "quad.ply").write_text(ply("0 0 0\n1 0 0\n1 1 0\n0 1 0\n", "4 0 1 2 3\n", 4, 1))
     assert read_mesh(tmp_path / "quad.ply").face_areas().sum() == pytest.approx(1.0)
-    parts = trimesh.Scene(
-        [trimesh.creation.box(), trimesh.creation.box(transform=trimesh.transformations.translation_matrix([5, 0, 0]))]
-    )
+    beside = trimesh.creation.box(transform=trimesh.transformations.translation_matrix([5, 0, 0]))
+    parts = trimesh.Scene([trimesh.creation.box(), beside])
     (tmp_path / "parts.glb").write_bytes(parts.export(file_type="glb"))
     both = read_mesh(tmp_path / "parts.glb")
     assert len(both.faces) == 24 and both.vertices[:, 0].max() == pytest.approx(5.5)
@@ -145,11 +144,10 @@ def test_polygons_and_several_parts_are_read(tmp_path):
 
 def test_normals_and_cutting():
     normals = MESH.vertex_normals()
-    outward = (MESH.vertices - [100.0, -20.0, 3.0]) / 40
-    assert ((normals * outward).sum(1) > 0.99).all()
-    upper = MESH.with_vertices(MESH.vertices[:, 2] > 3.0)
-    assert (upper.vertices[:, 2] > 3.0).all() and set(np.unique(upper.faces)) == set(range(len(upper.vertices)))
+    assert ((normals * BALL.vertices / 40).sum(1) > 0.99).all()
     expected = (MESH.vertices[MESH.faces][..., 2] > 3.0).all(1)
+    upper = MESH.with_faces(expected)
+    assert (upper.vertices[:, 2] > 3.0).all() and set(np.unique(upper.faces)) == set(range(len(upper.vertices)))
     assert upper.face_areas().sum() == pytest.approx(MESH.face_areas()[expected].sum())
 
 

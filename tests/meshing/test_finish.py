@@ -12,17 +12,18 @@ from sl_nerfstudio.meshing.finish import ClosedField, MarkedMesh, decimate, fill
 from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties, VertexQuality
 from sl_nerfstudio.meshing.visibility import Trimmed
 
-BALL = trimesh.creation.icosphere(4, 10.0)
-MESH = Mesh(np.asarray(BALL.vertices, dtype=np.float64), np.asarray(BALL.faces, dtype=np.int64))
+from .solids import mesh_of, together
+
+MESH = mesh_of(trimesh.creation.icosphere(4, 10.0))
 CENTRE = MESH.vertices[MESH.faces].mean(1)
 NORTH, EAST, SOUTH = np.array([0.0, 0, 10]), np.array([10.0, 0, 0]), np.array([0.0, 0, -10])
 
 
-def trimmed_by(removed: np.ndarray, denied: np.ndarray | None = None) -> Trimmed:
-    """A ball from which triangles were trimmed."""
-    observed = MESH.corners_of(~removed)
+def trimmed_by(removed: np.ndarray, denied: np.ndarray | None = None, mesh: Mesh = MESH) -> Trimmed:
+    """A mesh from which triangles were trimmed."""
+    observed = mesh.corners_of(~removed)
     denied = np.zeros(len(observed), dtype=bool) if denied is None else denied
-    return Trimmed(MESH.with_faces(~removed), ~removed, observed, denied, len(observed), 0, 0, 0, 0, 0.1)
+    return Trimmed(mesh.with_faces(~removed), ~removed, observed, denied, len(observed), 0, 0, 0, 0, 0.1)
 
 
 def cap(pole: np.ndarray, radius: float) -> np.ndarray:
@@ -63,12 +64,8 @@ def test_a_hole_that_frames_look_through_stays_open():
 def test_what_has_an_end_of_its_own_is_no_hole():
     """The zero level leaves the box there: it closes nothing."""
     cut = MESH.with_faces(CENTRE[:, 2] < 8)
-    centre = cut.vertices[cut.faces].mean(1)
-    kept = centre[:, 2] < 5
-    observed = cut.corners_of(kept)
-    nothing = np.zeros(len(observed), dtype=bool)
-    trimmed = Trimmed(cut.with_faces(kept), kept, observed, nothing, len(observed), 0, 0, 0, 0, 0.1)
-    found = fill_holes(cut, trimmed, 100.0)
+    kept = cut.vertices[cut.faces].mean(1)[:, 2] < 5
+    found = fill_holes(cut, trimmed_by(~kept, mesh=cut), 100.0)
     assert (found.closed, found.too_large) == (0, 0) and np.array_equal(found.kept, kept)
 
 
@@ -135,11 +132,9 @@ def test_a_field_that_leaves_the_box_becomes_a_closed_solid_cut_flat_at_walls_an
 
 
 def test_the_largest_component_is_the_one_with_the_largest_area():
-    fine, coarse = trimesh.creation.icosphere(3, 1.0), trimesh.creation.icosphere(1, 5.0)
-    vertices = np.concatenate([fine.vertices + [20, 0, 0], coarse.vertices]).astype(np.float64)
-    faces = np.concatenate([fine.faces, coarse.faces + len(fine.vertices)]).astype(np.int64)
-    marked = MarkedMesh(Mesh(vertices, faces), np.arange(len(vertices)) >= len(fine.vertices))
-    found = marked.largest_component()
+    fine, coarse = (mesh_of(trimesh.creation.icosphere(*size)) for size in ((3, 1.0), (1, 5.0)))
+    both = together(Mesh(fine.vertices + [20, 0, 0], fine.faces), coarse)
+    found = MarkedMesh(both, np.arange(len(both.vertices)) >= len(fine.vertices)).largest_component()
     assert len(found.mesh.faces) == len(coarse.faces) and found.invented.all()
     np.testing.assert_allclose(np.linalg.norm(found.mesh.vertices, axis=1), 5.0)
 

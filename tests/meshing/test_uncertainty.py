@@ -1,5 +1,6 @@
 """Uncertainty of vertices: derivatives, exact motions, a surface that is fitted again, noise by formula."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,20 +10,8 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
-from sl_nerfstudio.geometry.devices import (
-    Device,
-    Intrinsics,
-    project,
-    unproject,
-)
-from sl_nerfstudio.geometry.lie import (
-    DevicePoses,
-    Similarity,
-    exp_se3,
-    inverse,
-    rotate,
-    transform,
-)
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3, inverse, rotate, transform
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 from sl_nerfstudio.meshing.uncertainty import (
     AVERAGED_CELLS,
@@ -46,7 +35,7 @@ from sl_nerfstudio.scan import Scan
 from tests.bundle_adjustment.analytic import look_at
 
 from .ray_cast_scan import pairs_around, scan_of
-from .test_visibility import plate
+from .solids import plate, together
 
 CAMERA = Device(300, 300, 410.0, 400.0, 148.0, 152.0, k1=-0.1, p1=0.002)
 LIGHTS = (
@@ -89,6 +78,12 @@ def on_plane(d: FrameDevices, uv: Tensor, p: Tensor, normal: Tensor) -> Tensor:
     return project(d.projector, transform(T, eye + distance * ray))[0]
 
 
+def numeric(f: Callable[[Tensor], Tensor], size: int) -> Tensor:
+    """Derivatives of a function of `size` numbers at zero, in the last dimension, from differences."""
+    steps = STEP * torch.eye(size, dtype=torch.float64)
+    return torch.stack([(f(step) - f(-step)) / (2 * STEP) for step in steps], -1)
+
+
 def derivatives(d: FrameDevices, p: Tensor, normal: Tensor) -> Tensor:
     """Derivatives of the residuals by (delta, rho, intrinsics), from the compiled loop's function."""
     devices, view, out = packed_devices(d), np.empty(VIEW), np.empty((len(p), 2, 18))
@@ -104,16 +99,12 @@ def test_the_prediction_of_a_pixel_changes_as_rays_and_planes_do(light):
     view = view_surface(d, p, normal)
     uv = view.uv_camera
     assert torch.allclose(view.uv_projector, on_plane(d, uv, p, normal), atol=1e-9)
-    moved = [on_plane(d, uv, p + sign * STEP * normal, normal) for sign in (1, -1)]
-    assert torch.allclose(view.slope, (moved[0] - moved[1]) / (2 * STEP), rtol=1e-6, atol=1e-5)
-    for column, way in enumerate(torch.eye(2, dtype=torch.float64)):
-        beside = [on_plane(d, uv + sign * STEP * way, p, normal) for sign in (1, -1)]
-        assert torch.allclose(view.by_pixel[..., column], (beside[0] - beside[1]) / (2 * STEP), rtol=1e-6, atol=1e-5)
-    found = derivatives(d, p, normal)
-    for column, way in enumerate(torch.eye(18, dtype=torch.float64)):
-        after = [on_plane(changed(d, sign * STEP * way), uv, p, normal) for sign in (1, -1)]
-        expected = (after[0] - after[1]) / (2 * STEP)
-        assert torch.allclose(found[..., column], expected, rtol=2e-5, atol=2e-4), column
+    by_motion = numeric(lambda s: on_plane(d, uv, p + s * normal, normal), 1)
+    assert torch.allclose(view.slope, by_motion[..., 0], rtol=1e-6, atol=1e-5)
+    by_pixel = numeric(lambda step: on_plane(d, uv + step, p, normal), 2)
+    assert torch.allclose(view.by_pixel, by_pixel, rtol=1e-6, atol=1e-5)
+    by_devices = numeric(lambda step: on_plane(changed(d, step), uv, p, normal), 18)
+    assert torch.allclose(derivatives(d, p, normal), by_devices, rtol=2e-5, atol=2e-4)
 
 
 def test_pixels_on_an_area_are_those_of_its_projected_corners():
@@ -135,16 +126,11 @@ def test_a_point_is_seen_where_both_devices_project_it():
     def seen(devices: FrameDevices, q: Tensor) -> Tensor:
         T = inverse(devices.T_world_camera)
         light = inverse(devices.T_camera_projector) @ T
-        return torch.cat(
-            [project(devices.camera, transform(T, q))[0], project(devices.projector, transform(light, q))[0]], -1
-        )
+        both = (devices.camera, T), (devices.projector, light)
+        return torch.cat([project(device, transform(pose, q))[0] for device, pose in both], -1)
 
-    for column, way in enumerate(torch.eye(3, dtype=torch.float64)):
-        there = (seen(d, p + STEP * way) - seen(d, p - STEP * way)) / (2 * STEP)
-        assert torch.allclose(by_point[..., column], there, rtol=1e-6, atol=1e-5)
-    for column, way in enumerate(torch.eye(18, dtype=torch.float64)):
-        there = (seen(changed(d, STEP * way), p) - seen(changed(d, -STEP * way), p)) / (2 * STEP)
-        assert torch.allclose(by_rest[..., column], there, rtol=2e-5, atol=2e-4), column
+    assert torch.allclose(by_point, numeric(lambda step: seen(d, p + step), 3), rtol=1e-6, atol=1e-5)
+    assert torch.allclose(by_rest, numeric(lambda step: seen(changed(d, step), p), 18), rtol=2e-5, atol=2e-4)
 
 
 FRAMES, NOISE, CELL = 4, 0.4, 2.0
@@ -305,12 +291,9 @@ def test_independent_part_is_the_noise_of_the_averaged_pixels(views: list[FrameV
     on_truth = replace(sums, pull=np.zeros_like(sums.pull), correlation=1.0)
     area = AVERAGED_CELLS * CELL**2
     v = seen[len(seen) // 2]
-    weight = [
-        (area * view.pixels_per_area[at] * (view.slope[at] ** 2).sum(1), view.noise_px)
-        for view in views
-        if (at := view.vertex == v).any()
-    ]
-    expected = sum(float(w[0]) * noise**2 for w, noise in weight) / sum(float(w[0]) for w, _ in weight) ** 2
+    weights = [area * view.pixels_per_area * (view.slope**2).sum(1) * (view.vertex == v) for view in views]
+    variance = sum(w.sum() * view.noise_px**2 for w, view in zip(weights, views, strict=True))
+    expected = variance / sum(w.sum() for w in weights) ** 2
     assert independent_variance(mesh, on_truth, area)[v] == pytest.approx(expected)
     # a surface that lies 0.6 mm beside what the pixels say is that uncertain
     beside = replace(on_truth, pull=0.6 * sums.weight)
@@ -346,8 +329,7 @@ def test_vertices_that_no_frame_confirms_are_marked(scan: Scan):
     height = 10 * np.exp(-(x.vertices[:, 0] ** 2 + (x.vertices[:, 1] - 5) ** 2) / 300)
     top = Mesh(x.vertices + height[:, None] * [0, 0, 1], x.faces)
     count = len(top.vertices)
-    below = top.vertices - [0.0, 0.0, 5.0]
-    mesh = Mesh(np.concatenate([top.vertices, below]), np.concatenate([top.faces, top.faces[:, ::-1] + count]))
+    mesh = together(top, Mesh(top.vertices - [0.0, 0.0, 5.0], top.faces[:, ::-1]))
     found: VertexQuality = vertex_uncertainty(mesh, scan, scan.poses, random_joint(), CELL)
     inside = np.abs(top.vertices[:, :2]).max(1)
     assert (found.views[:count][inside < 25] > 0).all() and (found.views[:count][inside > 33] == 0).all()

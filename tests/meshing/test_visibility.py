@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
-from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3, exp_so3
 from sl_nerfstudio.geometry.triangulation import pixel_rays, world_pixels
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
@@ -22,6 +21,7 @@ from sl_nerfstudio.meshing.visibility import (
     OFF_MASK_PX,
     FrameCounts,
     Occluder,
+    Trimmed,
     compare_decoded,
     count_frames,
     packed_device,
@@ -32,17 +32,9 @@ from sl_nerfstudio.scan import Scan
 from tests.formulas import pixels
 
 from .ray_cast_scan import CAMERA, PROJECTOR, look_at, pairs_around, scan_of
+from .solids import plate, together, triangles_at_edges
 
 POSES = (look_at((60.0, 0.0, 290.0)), look_at((-40.0, 30.0, 290.0)))
-
-
-def plate(half: float, cell: float, z: float = 0.0) -> Mesh:
-    """A square at a height z, seen from above."""
-    n = int(2 * half / cell) + 1
-    x, y = np.meshgrid(np.linspace(-half, half, n), np.linspace(-half, half, n))
-    i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1, 1)
-    faces = np.concatenate([i + np.array([0, 1, n]), i + np.array([1, n + 1, n])])
-    return Mesh(np.stack([x.ravel(), y.ravel(), np.full(n * n, z)], 1), faces)
 
 
 @pytest.fixture(scope="module")
@@ -213,9 +205,7 @@ def test_bounds_are_those_of_the_formulas_for_arrays(devices: tuple[Device, Devi
 
     offsets, outside = np.full((len(which), 2), np.nan), np.empty((len(which), 2), dtype=bool)
     packed = np.stack([packed_device(device, T) for device, T in zip(devices, poses, strict=True)])
-    compare_decoded(
-        *(len(which), points, normals, which, uv, coords, mask, grown, packed, MOST_PX, offsets, outside),
-    )
+    compare_decoded(len(which), points, normals, which, uv, coords, mask, grown, packed, MOST_PX, offsets, outside)
     J = jacobian(points[which], normals[which], uv, devices, poses)
     wanted, whole = bounds(coords, uv, J)
     column, row = np.floor(uv[:, 0]).astype(int).T
@@ -241,14 +231,6 @@ def ball(centre: tuple[float, float, float], radius: float, cell: float = 1.5) -
     )
 
 
-def together(*parts: Mesh) -> Mesh:
-    offsets = np.cumsum([0, *(len(p.vertices) for p in parts)])[:-1]
-    return Mesh(
-        np.concatenate([p.vertices for p in parts]),
-        np.concatenate([p.faces + o for p, o in zip(parts, offsets, strict=True)]),
-    )
-
-
 def contains(mesh: Mesh, points: np.ndarray) -> np.ndarray:
     """Which points are vertices of the mesh."""
     known = {tuple(v) for v in mesh.vertices.round(9)}
@@ -258,22 +240,13 @@ def contains(mesh: Mesh, points: np.ndarray) -> np.ndarray:
 def angle_beyond_horizon_deg(points: np.ndarray) -> np.ndarray:
     """For points of the ball at the origin: by how much the best frame sees and lights them (negative: not at all)."""
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
-    height = [
-        np.min(
-            [
-                np.arcsin(((T[:3, 3] - points) * normals).sum(1) / np.linalg.norm(T[:3, 3] - points, axis=1))
-                for T in pair
-            ],
-            0,
-        )
-        for pair in RING
-    ]
-    return np.degrees(np.max(height, 0))
+    way = np.array(RING)[..., None, :3, 3] - points  # ring, device, point
+    height = np.arcsin((way * normals).sum(-1) / np.linalg.norm(way, axis=-1))
+    return np.degrees(height.min(1).max(0))
 
 
 def euler(mesh: Mesh) -> int:
-    edges = np.sort(np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]]), axis=1)
-    return len(mesh.vertices) - len(np.unique(edges, axis=0)) + len(mesh.faces)
+    return len(mesh.vertices) - len(triangles_at_edges(mesh)[0]) + len(mesh.faces)
 
 
 @pytest.fixture(scope="module")
@@ -286,8 +259,13 @@ def ball_scan(truth, tmp_path_factory):
     return scan_of(truth, RING, tmp_path_factory.mktemp("trim") / "scan")
 
 
-def test_the_unseen_side_of_a_ball_is_cut_at_its_horizon(truth, ball_scan):
-    result = trim_to_observed(truth, ball_scan)
+@pytest.fixture(scope="module")
+def result(truth, ball_scan) -> Trimmed:
+    """What is kept of the ball."""
+    return trim_to_observed(truth, ball_scan)
+
+
+def test_the_unseen_side_of_a_ball_is_cut_at_its_horizon(truth, result):
     kept = contains(result.mesh, truth.vertices)
     margin = angle_beyond_horizon_deg(truth.vertices)
     assert kept[margin > 18].all()  # the last pixel of the ball's image is 18 degrees of it
@@ -308,8 +286,8 @@ def test_a_phantom_in_front_goes_and_what_it_hid_stays(truth, tmp_path):
     result = trim_to_observed(together(truth, phantom), ball_scan)
     assert not contains(result.mesh, phantom.vertices).any()
     assert np.array_equal(contains(result.mesh, truth.vertices), contains(plain, truth.vertices))
-    centre = 62 * TOWARDS_FIRST_CAMERA
-    faces = [((T[:3, 3] - phantom.vertices) * (phantom.vertices - centre)).sum(1) > 0 for T in RING[0]]
+    outward = phantom.vertices - 62 * TOWARDS_FIRST_CAMERA
+    faces = [((T[:3, 3] - phantom.vertices) * outward).sum(1) > 0 for T in RING[0]]
     assert result.contradicted == pytest.approx((faces[0] & faces[1]).sum(), rel=0.1)
 
 
@@ -382,13 +360,13 @@ def test_wrongly_decoded_cells_make_no_hole(truth, faces_observed, tmp_path, fra
     assert frames > 1 or result.closed > 0
 
 
-def test_noise_of_coordinates_and_poses_cuts_nothing(truth, ball_scan, tmp_path):
+def test_noise_of_coordinates_and_poses_cuts_nothing(truth, result, tmp_path):
     rng = np.random.default_rng(0)
     noisy = scan_of(truth, RING, tmp_path / "scan", lambda i, c: c + rng.normal(0, 1, c.shape).astype(np.float32))
     tilt = exp_se3(torch.tensor([0.5, -0.5, 0.5, 0.003, 0.002, -0.003], dtype=torch.float64)).numpy()
     moved = DevicePoses(noisy.poses.T_world_camera @ tilt, noisy.poses.T_world_projector)
     faces = len(trim_to_observed(truth, noisy, moved).mesh.faces)
-    assert faces == pytest.approx(len(trim_to_observed(truth, ball_scan).mesh.faces), rel=0.02)
+    assert faces == pytest.approx(len(result.mesh.faces), rel=0.02)
 
 
 def test_shadows_and_hidden_parts_of_a_plane(tmp_path):
@@ -398,9 +376,8 @@ def test_shadows_and_hidden_parts_of_a_plane(tmp_path):
     T_camera, T_projector = look_at((150.0, 0.0, 300.0)), look_at((-150.0, 60.0, 300.0))
     result = trim_to_observed(both, scan_of(both, [(T_camera, T_projector)], tmp_path / "scan"))
     kept = contains(result.mesh, plane.vertices)
-    clear = np.min(
-        [clearance(plane.vertices, T[:3, 3], np.array([0.0, 0.0, 25.0])) for T in (T_camera, T_projector)], 0
-    )
+    centre = np.array([0.0, 0.0, 25.0])
+    clear = np.min([clearance(plane.vertices, T[:3, 3], centre) for T in (T_camera, T_projector)], 0)
     central = np.abs(plane.vertices).max(1) < 55
     assert kept[central & (clear > 12 + 4)].all()  # a camera pixel is 2 mm here
     assert not kept[clear < 12 - 4].any()
@@ -462,32 +439,23 @@ def covered_pixels(T_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Pixels within two of a projection of the points."""
     u, v = pixels(CAMERA, T_camera, points).T
     out = np.zeros((96, 96), dtype=bool)
-    for dy in range(-2, 3):
-        for dx in range(-2, 3):
-            out[(v + dy).astype(int).clip(0, 95), (u + dx).astype(int).clip(0, 95)] = True
+    for dy, dx in product(range(-2, 3), repeat=2):
+        out[(v + dy).astype(int).clip(0, 95), (u + dx).astype(int).clip(0, 95)] = True
     return out
 
 
-def test_given_poses_replace_those_of_the_scan(truth, ball_scan):
-    S = Similarity(
-        1.0,
-        exp_se3(torch.tensor([0, 0, 0, 0.3, -0.2, 0.9], dtype=torch.float64)).numpy()[:3, :3],
-        np.array([500.0, -20, 7]),
-    )
+def test_given_poses_replace_those_of_the_scan(truth, ball_scan, result):
+    R = exp_so3(torch.tensor([0.3, -0.2, 0.9], dtype=torch.float64)).numpy()
+    S = Similarity(1.0, R, np.array([500.0, -20, 7]))
     moved = trim_to_observed(truth.mapped(S), ball_scan, ball_scan.poses.mapped(S)).mesh
-    assert len(moved.faces) == pytest.approx(len(trim_to_observed(truth, ball_scan).mesh.faces), rel=2e-3)
+    assert len(moved.faces) == pytest.approx(len(result.mesh.faces), rel=2e-3)
 
 
 def test_wrong_poses_say_so(truth, ball_scan):
-    upside_down = np.diag([1.0, -1.0, -1.0, 1.0])
-    with pytest.raises(
-        UserError,
-        match=r"the frames observed no part(.|\n)*no vertex that faces camera and projector is inside a mask"
-        r"(.|\n)*last step(.|\n)*sl-process(.|\n)*--keep-unobserved",
-    ):
-        poses = DevicePoses(
-            ball_scan.poses.T_world_camera @ upside_down, ball_scan.poses.T_world_projector @ upside_down
-        )
+    upside_down, given = np.diag([1.0, -1.0, -1.0, 1.0]), ball_scan.poses
+    poses = DevicePoses(given.T_world_camera @ upside_down, given.T_world_projector @ upside_down)
+    said = r"the frames observed no part(.|\n)*no vertex that faces camera and projector is inside a mask"
+    with pytest.raises(UserError, match=rf"{said}(.|\n)*last step(.|\n)*sl-process(.|\n)*--keep-unobserved"):
         trim_to_observed(truth, ball_scan, poses)
 
 
@@ -496,6 +464,6 @@ def test_another_surface_says_so(ball_scan):
         trim_to_observed(ball((0.0, 0.0, -70.0), 25.0), ball_scan)
 
 
-def test_missing_mask_files_mean_decoded_pixels(truth, ball_scan, tmp_path: Path):
+def test_missing_mask_files_mean_decoded_pixels(truth, ball_scan, result):
     without = replace(ball_scan, frames=tuple(replace(f, mask_path=None) for f in ball_scan.frames))
-    assert len(trim_to_observed(truth, without).mesh.faces) == len(trim_to_observed(truth, ball_scan).mesh.faces)
+    assert len(trim_to_observed(truth, without).mesh.faces) == len(result.mesh.faces)

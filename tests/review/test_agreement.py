@@ -117,7 +117,7 @@ def test_a_frame_that_nobody_else_saw_is_unconfirmed(scan):
 
 
 @pytest.mark.parametrize("axis, sigmas", [(0, 9.0), (1, 9.0), (2, 9.0), (1, 4.0)])
-def test_frames_far_from_their_starts_are_named_by_how_far_they_turned(scan, axis, sigmas):
+def test_frames_far_from_their_starts_are_named_by_how_far_they_turned(scan, axis, sigmas, monkeypatch):
     """Positions do not count; where no uncertainty was stated, the usual one does."""
     stated, angle = 0.5, sigmas * np.sqrt(3) * 0.5
     frames = tuple(replace(f, pose_sigma=PoseSigma(0.001, stated, 0.001, stated)) for f in scan.frames[:-1])
@@ -132,7 +132,8 @@ def test_frames_far_from_their_starts_are_named_by_how_far_they_turned(scan, axi
         assert one.turned_deg == pytest.approx(angle, rel=1e-6) and one.sigma_deg == stated
         assert [r.band for r in departed_reasons(found)] == ["acceptable"]
         assert f"{one.name} ({angle:.1f} deg, stated 0.5)" in describe_departed(found)
-    usual = departed_frames(replace(scan, frames=frames), DevicePoses(T, scan.poses.T_world_projector), stated)
+    monkeypatch.setattr("sl_nerfstudio.review.verdict.USUAL_FRAME_ROTATION_DEG", stated)
+    usual = departed_frames(replace(scan, frames=frames), DevicePoses(T, scan.poses.T_world_projector))
     assert [one.name for one in usual] == ([scan.frames[k].name for k in (3, -1)] if sigmas > 6 else [])
     for one in usual[1:]:
         assert f"{one.name} ({angle:.1f} deg, usual 0.5)" in describe_departed(usual)

@@ -4,6 +4,7 @@ import json
 import math
 import sys
 import types
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,14 +43,10 @@ SHIFT = pose([0, 9, 0], [70.0, 4.0, -3.0])
 
 
 def frames(camera: Device = CAMERA, projector: Device = DOE, placed=(True, True, True)) -> PosedFrames:
-    names = [f"frame_{k:05d}" for k in range(len(POSES))]
-    return PosedFrames(
-        tuple(PosedDevice(n, camera, T, Path(f"/scan/images/{n}.png")) for n, T in zip(names, POSES, strict=True)),
-        tuple(
-            PosedDevice(n, projector, T @ SHIFT, Path("/scan/pattern.png")) for n, T in zip(names, POSES, strict=True)
-        ),
-        tuple(placed),
-    )
+    named = [(f"frame_{k:05d}", T) for k, T in enumerate(POSES)]
+    cameras = tuple(PosedDevice(n, camera, T, Path(f"/scan/images/{n}.png")) for n, T in named)
+    projectors = tuple(PosedDevice(n, projector, T @ SHIFT, Path("/scan/pattern.png")) for n, T in named)
+    return PosedFrames(cameras, projectors, placed)
 
 
 def pixel(device: Device, T: np.ndarray, p: np.ndarray) -> np.ndarray:
@@ -90,14 +87,11 @@ def test_colmap_projects_the_corner_to_the_right_pixels_of_cameras_and_projector
     images = {image.name: image for image in model.images.values()}
     assert len(images) == 6 and len(model.cameras) == 2 and len(model.points3D) == 2
     for k in range(3):
-        for name, posed in (
-            (f"images/frame_{k:05d}.png", of.cameras[k]),
-            (f"projector/frame_{k:05d}.png", of.projectors[k]),
-        ):
-            expected = pixel(posed.device, posed.T_world_device, CORNER)
-            np.testing.assert_allclose(images[name].project_point(CORNER), expected, atol=2e-5)
-            np.testing.assert_allclose(images[name].points2D[0].xy, expected, atol=1e-4)
-            assert images[name].points2D[0].point3D_id == 1
+        for folder, posed in (("images", of.cameras[k]), ("projector", of.projectors[k])):
+            image, expected = images[f"{folder}/frame_{k:05d}.png"], pixel(posed.device, posed.T_world_device, CORNER)
+            np.testing.assert_allclose(image.project_point(CORNER), expected, atol=2e-5)
+            np.testing.assert_allclose(image.points2D[0].xy, expected, atol=1e-4)
+            assert image.points2D[0].point3D_id == 1
     assert np.array_equal(model.points3D[2].color, [40, 50, 60]) and model.points3D[1].track.length() == 6
     assert model.points3D[1].error == pytest.approx(0.25)  # half a pixel in projectors, none in cameras
 
@@ -105,11 +99,9 @@ def test_colmap_projects_the_corner_to_the_right_pixels_of_cameras_and_projector
 def test_devices_that_are_fixed_to_each_other_are_one_rig_of_colmap(tmp_path):
     fixed = read_colmap(tmp_path, frames(PINHOLE))  # all of these have one relative pose
     assert len(fixed.rigs) == 1 and len(fixed.frames) == 3
-    turned = frames(PINHOLE)
-    other = PosedDevice(
-        "frame_00001", DOE, POSES[1] @ pose([0, 9.001, 0], [70.0, 4.0, -3.0]), Path("/scan/pattern.png")
-    )
-    free = PosedFrames(turned.cameras, (turned.projectors[0], other, turned.projectors[2]), turned.placed)
+    first, second, third = frames(PINHOLE).projectors
+    other = replace(second, T_world_device=POSES[1] @ pose([0, 9.001, 0], [70.0, 4.0, -3.0]))
+    free = replace(frames(PINHOLE), projectors=(first, other, third))
     (tmp_path / "free").mkdir()
     model = read_colmap(tmp_path / "free", free)
     assert len(model.rigs) == 2 and len(model.frames) == 6
@@ -126,12 +118,11 @@ def test_frames_that_are_not_placed_are_no_images_of_colmap(tmp_path):
 
 
 def test_what_colmap_cannot_hold_is_refused():
-    bent = Device(**{**vars(DOE), "k1": 0.1})
+    bent = replace(DOE, k1=0.1)
     with pytest.raises(UserError, match=r"diffractive element and lens distortion(.|\n)*remedy"):
         require_possible(frames(projector=bent), Path("/scan"))
-    spaced = frames()
-    first = PosedDevice("a", CAMERA, POSES[0], Path("/scan/images/a b.png"))
-    spaced = PosedFrames((first, *spaced.cameras[1:]), spaced.projectors, spaced.placed)
+    first, *others = frames().cameras
+    spaced = replace(frames(), cameras=(replace(first, image=Path("/scan/images/a b.png")), *others))
     with pytest.raises(UserError, match=r"'images/a b.png' has a space(.|\n)*rename"):
         require_possible(spaced, Path("/scan"))
     require_possible(frames(), Path("/scan"))

@@ -29,37 +29,20 @@ from sl_nerfstudio.runs.export import (
 from sl_nerfstudio.runs.export_settings import ExportSettings
 from sl_nerfstudio.scan import Scan
 from tests.meshing.ray_cast_scan import pairs_around, scan_of
+from tests.meshing.solids import mesh_of, plate, together
 
 from .ball_run import BallModel
 
 RADIUS = 25.0
 
 
-def _mesh(*parts: trimesh.Trimesh) -> Mesh:
-    vertices, faces, count = [], [], 0
-    for part in parts:
-        vertices.append(np.asarray(part.vertices))
-        faces.append(np.asarray(part.faces) + count)
-        count += len(part.vertices)
-    return Mesh(np.concatenate(vertices).astype(np.float64), np.concatenate(faces).astype(np.int64))
-
-
-def _grid(half: float, z: float) -> trimesh.Trimesh:
-    n = 60
-    x, y = np.meshgrid(np.linspace(-half, half, n), np.linspace(-half, half, n), indexing="ij")
-    index = np.arange(n * n).reshape(n, n)
-    a, b, c, d = (v.ravel() for v in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
-    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
-    return trimesh.Trimesh(np.stack([x, y, np.full_like(x, z)], -1).reshape(-1, 3), faces, process=False)
-
-
-BALL = trimesh.creation.icosphere(4, RADIUS)
-TABLE = _grid(140.0, -RADIUS)
+BALL = mesh_of(trimesh.creation.icosphere(4, RADIUS))
+MESH = together(BALL, plate(140.0, 4.75, -RADIUS))  # on a table
 
 
 @pytest.fixture(scope="module")
 def scan(tmp_path_factory) -> Scan:
-    return scan_of(_mesh(BALL, TABLE), pairs_around(8, 45), tmp_path_factory.mktemp("cut") / "scan")
+    return scan_of(MESH, pairs_around(8, 45), tmp_path_factory.mktemp("cut") / "scan")
 
 
 @pytest.fixture(scope="module")
@@ -68,12 +51,11 @@ def found(scan) -> Separation:
 
 
 def test_the_table_goes_and_the_ball_stays(found):
-    mesh = _mesh(BALL, TABLE)
-    cut = cut_object(mesh, found)
-    kept = mesh.with_faces(cut.kept)
+    cut = cut_object(MESH, found)
+    kept = MESH.with_faces(cut.kept)
     np.testing.assert_allclose(np.linalg.norm(kept.vertices, axis=1), RADIUS, rtol=0.03)
     assert len(cut.removed) == 1 and abs(cut.removed[0].plane.normal[2]) > 0.9999
-    assert cut.area_before == pytest.approx(mesh.face_areas().sum())
+    assert cut.area_before == pytest.approx(MESH.face_areas().sum())
     assert cut.area_before - cut.area_removed == pytest.approx(kept.face_areas().sum())
     seen = BALL.vertices[:, 2] > -0.5 * RADIUS
     assert kept.vertices[:, 2].max() > 0.99 * RADIUS and len(kept.vertices) > 0.95 * seen.sum()
@@ -98,14 +80,14 @@ def test_a_tilted_world_stands_upright(scan, found, monkeypatch, align):
     moved = SimpleNamespace(plane=Plane(normal, plane.offset + float(normal @ tilt.t)))
     tilted = SimpleNamespace(surroundings=[SimpleNamespace(finding=moved)])
     monkeypatch.setattr("sl_nerfstudio.runs.export.separate_scan", lambda *_: tilted)
-    S = standing(align, _mesh(BALL).mapped(tilt), scan, scan.poses.mapped(tilt)) @ tilt
+    S = standing(align, BALL.mapped(tilt), scan, scan.poses.mapped(tilt)) @ tilt
     np.testing.assert_allclose(S.R[2], [0, 0, 1], atol=1e-2)  # what was up is up again
     if align == "plane":
         np.testing.assert_allclose(S.points(np.zeros(3)), [0, 0, RADIUS], atol=0.1)
     tilted.surroundings.clear()
     if align == "plane":
         with pytest.raises(UserError, match=r"--align plane: no plane was found[\s\S]*remedy: give --align z-up"):
-            standing(align, _mesh(BALL), scan, scan.poses)
+            standing(align, BALL, scan, scan.poses)
 
 
 class BallOnTable(BallModel):
@@ -132,9 +114,8 @@ def test_a_closed_solid_of_the_object_alone_stands_flat_where_the_table_was(scan
 
 
 def test_the_summary_says_what_was_removed_and_why(scan, found):
-    mesh = _mesh(BALL, TABLE)
-    cut = cut_object(mesh, found)
-    marked = MarkedMesh(mesh, np.zeros(len(mesh.vertices), dtype=bool)).with_faces(cut.kept)
+    cut = cut_object(MESH, found)
+    marked = MarkedMesh(MESH, np.zeros(len(MESH.vertices), dtype=bool)).with_faces(cut.kept)
     surface = ExtractedSurface(marked, None, None, cut, 0, 1.0)
     nothing = VertexQuality(np.zeros(0), np.zeros(0), np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0))
     properties = VertexProperties(nothing, marked.invented)
@@ -145,7 +126,7 @@ def test_the_summary_says_what_was_removed_and_why(scan, found):
 
 
 def test_a_surface_elsewhere_leaves_nothing(found):
-    far = Mesh(BALL.vertices + 500.0, np.asarray(BALL.faces, np.int64))
+    far = Mesh(BALL.vertices + 500.0, BALL.faces)
     with pytest.raises(UserError, match=r"leaves nothing of the surface\n.*far from the scan's decoded points"):
         cut_object(far, found)
 
@@ -154,6 +135,6 @@ def test_a_scan_without_coordinates_is_refused(tmp_path):
     def nothing(_, coords):
         return np.full_like(coords, np.nan)
 
-    empty = scan_of(_mesh(BALL, TABLE), pairs_around(2, 45), tmp_path / "scan", nothing)
+    empty = scan_of(MESH, pairs_around(2, 45), tmp_path / "scan", nothing)
     with pytest.raises(UserError, match="no frame has decoded coordinates, so --object-only cannot find the object"):
         separate_scan(empty, empty.poses)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -42,29 +43,6 @@ _THUMBNAIL = 360  # pixels
 _ARROW = 0.06  # of the image's width: length of the arrow of the largest usual residual
 
 
-@dataclass(frozen=True)
-class PoseCard:
-    """One pose of the board."""
-
-    picture: str  # data address
-    name: str
-    problem: str | None
-    figures: tuple[tuple[str, float, float, int], ...]  # device, RMS, predicted error when left out, corners
-
-
-@dataclass(frozen=True)
-class DeviceTable:
-    """The numbers of a device, with their standard deviations."""
-
-    name: str
-    device: Device
-    rows: tuple[tuple[str, float, float], ...]
-    model: str
-    rms_px: float
-    left_out_px: float
-    field: str  # data address: residuals over the image
-
-
 def render_calibration_report(
     found: BoardCalibration, captures: BoardCaptures, verdict: Verdict, next_pose: str, command: str
 ) -> str:
@@ -83,15 +61,23 @@ def render_calibration_report(
     return page("calibration.html.j2", values)
 
 
-def _device_table(found: BoardCalibration, k: int) -> DeviceTable:
+def _device_table(found: BoardCalibration, k: int) -> dict[str, Any]:
+    """The numbers of a device, with their standard deviations, and its residuals over the image."""
     device, sigma = found.adjusted.rig.devices[k], found.sigmas[k]
-    rows = tuple((key, getattr(device, key), sigma.values[key]) for key in PARAMETERS if sigma.values[key])
     corners = [view.camera if k == 0 else view.projector for view in found.views]
-    field = _residual_field(device, corners, found.residuals[k])
-    return DeviceTable(DEVICES[k], device, rows, str(found.free[k]), found.rms_px[k], found.left_out.error_px[k], field)
+    return {
+        "name": DEVICES[k],
+        "device": device,
+        "rows": [(key, getattr(device, key), sigma.values[key]) for key in PARAMETERS if sigma.values[key]],
+        "model": str(found.free[k]),
+        "rms_px": found.rms_px[k],
+        "left_out_px": found.left_out.error_px[k],
+        "field": _residual_field(device, corners, found.residuals[k]),
+    }
 
 
-def _cards(found: BoardCalibration, pictures: Sequence[BoardPicture]) -> list[PoseCard]:
+def _cards(found: BoardCalibration, pictures: Sequence[BoardPicture]) -> list[dict[str, Any]]:
+    """What is shown of each pose of the board; figures: device, RMS, predicted error when left out, corners."""
     number = {view.name: k for k, view in enumerate(found.views)}
     out = []
     for picture in pictures:
@@ -102,15 +88,16 @@ def _cards(found: BoardCalibration, pictures: Sequence[BoardPicture]) -> list[Po
                 if len(r):
                     rms = float(np.sqrt((r**2).mean()))
                     figures.append((DEVICES[k], rms, float(found.left_out.by_view_px[k, place]), len(r)))
-        out.append(PoseCard(_thumbnail(picture), picture.name, picture.problem, tuple(figures)))
+        shown = {"picture": _thumbnail(picture), "name": picture.name, "problem": picture.problem}
+        out.append({**shown, "figures": figures})
     return out
 
 
 def _chart(found: BoardCalibration) -> str:
-    series = [
-        charts.Bars(DEVICES[k], [float(np.sqrt((r**2).mean())) if len(r) else np.nan for r in residuals])
+    series = {
+        DEVICES[k]: [float(np.sqrt((r**2).mean())) if len(r) else np.nan for r in residuals]
         for k, residuals in enumerate(found.residuals)
-    ]
+    }
     return charts.frame_bars("Residual of the corners by pose (RMS)", "px", series, wide=True)
 
 
@@ -301,19 +288,18 @@ def _charts(frames: Sequence[FrameRecord]) -> list[tuple[str, str]]:
 
     drawn = [
         ("Decoded: share of the visible pattern, and of the surface that other frames show", "%",
-         [charts.Bars("pattern", values("decode_rate", 100.0)),
-          charts.Bars("surface", values("shared_decoded", 100.0))]),
+         {"pattern": values("decode_rate", 100.0), "surface": values("shared_decoded", 100.0)}),
         ("Missing: of the surface that other frames show in the sight of both devices, where no pattern was seen", "%",
-         [charts.Bars("missing", values("missing_share", 100.0))]),
+         {"missing": values("missing_share", 100.0)}),
         ("Epipolar residual: how well coordinates fit the frame's own relative pose", "pattern px",
-         [charts.Bars("epipolar", values("epipolar_px"))]),
+         {"epipolar": values("epipolar_px")}),
         ("Uncertainty (1 sigma) of the projector's pose relative to the camera", "degrees",
-         [charts.Bars("rotation", values("relative_sigma_rotation_deg")),
-          charts.Bars("baseline's direction", values("relative_sigma_direction_deg"))]),
+         {"rotation": values("relative_sigma_rotation_deg"),
+          "baseline's direction": values("relative_sigma_direction_deg")}),
         ("Agreement with overlapping frames", "% of the points",
-         [charts.Bars("surfaces", values("fitness", 100.0)), charts.Bars("coordinates", values("cross_share", 100.0))]),
+         {"surfaces": values("fitness", 100.0), "coordinates": values("cross_share", 100.0)}),
         ("Coordinates of this frame against those of the others", "pattern px",
-         [charts.Bars("95 % below", values("cross_px_p95")), charts.Bars("median", values("cross_px_median"))]),
+         {"95 % below": values("cross_px_p95"), "median": values("cross_px_median")}),
     ]  # fmt: skip
-    known = [(title, unit, bars) for title, unit, bars in drawn if any(not math.isnan(v) for v in bars[0].values)]
+    known = [one for one in drawn if not all(map(math.isnan, next(iter(one[2].values()))))]
     return [(title, charts.frame_bars(title, unit, bars)) for title, unit, bars in known]

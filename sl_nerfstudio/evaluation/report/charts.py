@@ -5,7 +5,7 @@ import io
 import math
 import re
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -134,7 +134,7 @@ def _shade(
 ) -> Float[ndarray, "n 3"]:
     weights = _barycentric(surface, face, p)
     corners = surface.faces[face]
-    normal = (surface.vertex_normals[corners] * weights[..., None]).sum(1)
+    normal = (surface.mesh.vertex_normals()[corners] * weights[..., None]).sum(1)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
     base = np.array(CLAY) if colours is None else (colours[corners] * weights[..., None]).sum(1)
     return np.clip(base * _brightness(normal, right, up, back)[:, None], 0, 1)
@@ -176,8 +176,7 @@ def render_discs(
 
 
 def _barycentric(surface: IndexedMesh, face: ndarray, p: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
-    a, b, c = (surface.vertices[surface.faces[face, k]] for k in range(3))
-    normal = surface.face_cross[face]
+    (a, b, c), normal = surface.corners(face), surface.face_cross[face]
     norm2 = np.maximum((normal**2).sum(1), 1e-300)
     u = (np.cross(c - b, p - b) * normal).sum(1) / norm2
     v = (np.cross(a - c, p - c) * normal).sum(1) / norm2
@@ -222,25 +221,16 @@ _RC = {
 }
 
 
-@dataclass(frozen=True)
-class Bars:
-    """One series of a bar chart with one bar per frame."""
-
-    label: str
-    values: Sequence[float]
-
-
-def frame_bars(title: str, unit: str, series: Sequence[Bars], wide: bool = False) -> str:
-    """Bars per frame, several series side by side; `wide` fills the width of the page."""
+def frame_bars(title: str, unit: str, series: Mapping[str, Sequence[float]], wide: bool = False) -> str:
+    """Bars per frame, several series, by their names, side by side; `wide` fills the width of the page."""
     with matplotlib.rc_context(_RC):
         figure, axes = _figure(10.4 if wide else 5.4, 2.1)
-        count = len(series[0].values)
         width = 0.8 / len(series)
-        for k, one in enumerate(series):
-            x = np.arange(count) + (k - (len(series) - 1) / 2) * width
-            y = np.nan_to_num(np.asarray(one.values, np.float64))
-            axes.bar(x, y, width, color=(BLUE, ORANGE)[k % 2], label=one.label)
-        axes.set_xlim(-0.7, count - 0.3)
+        for k, (label, values) in enumerate(series.items()):
+            x = np.arange(len(values)) + (k - (len(series) - 1) / 2) * width
+            y = np.nan_to_num(np.asarray(values, np.float64))
+            axes.bar(x, y, width, color=(BLUE, ORANGE)[k % 2], label=label)
+        axes.set_xlim(-0.7, len(next(iter(series.values()))) - 0.3)
         axes.set_ylim(bottom=0)
         axes.set_xlabel("frame")
         axes.set_ylabel(unit)

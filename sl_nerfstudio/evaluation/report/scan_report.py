@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
 from typing import Any
@@ -17,7 +17,7 @@ from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement,
 from sl_nerfstudio.evaluation.evaluate import Evaluation, EvaluationInputs, Length
 from sl_nerfstudio.evaluation.judgement import MAIN_FIGURES, Judgement, main_figures
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
-from sl_nerfstudio.evaluation.reference import MeshReference, PoseErrors, compare_poses
+from sl_nerfstudio.evaluation.reference import MeshReference, compare_poses
 from sl_nerfstudio.evaluation.report import charts
 from sl_nerfstudio.evaluation.report.capture_reports import captures_of
 from sl_nerfstudio.evaluation.report.charts import (
@@ -34,11 +34,11 @@ from sl_nerfstudio.evaluation.report.charts import (
     residual_colours,
     shrink,
 )
-from sl_nerfstudio.evaluation.report.view3d import View, mesh_scene
+from sl_nerfstudio.evaluation.report.view3d import mesh_scene
 from sl_nerfstudio.geometry.devices import DeviceChange, IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.parallel import results
-from sl_nerfstudio.scan import Frame, PoseSigma, Scan
+from sl_nerfstudio.scan import Frame, Scan
 
 # Small residual maps of every frame, made while the frames are evaluated one by one.
 
@@ -202,17 +202,6 @@ class ReportInput:
         return "" if path is None else f"{path.parent.name}/{path.name}"
 
 
-@dataclass(frozen=True)
-class SurfacePictures:
-    """Shaded views of the surface, with error colours where there is a reference."""
-
-    views: list[str]  # data addresses
-    view: View
-    scale: ColourScale | None
-    layers: list[str]  # names of what the interactive view can be coloured by
-    histogram: str  # SVG, "" without a reference
-
-
 def render_report(report: ReportInput) -> str:
     """The page as text."""
     evaluation, scan = report.evaluation, report.inputs.scan
@@ -223,10 +212,10 @@ def render_report(report: ReportInput) -> str:
     not_good = {SECTIONS[figure.name] for figure in judged if figure.band != "good"}
     not_good |= {"residuals"} if outliers else set()
     not_good |= {"poses"} if report.inputs.unplaced else set()
-    residuals = [
-        charts.Bars("coordinates", [f.coordinate_px_median for f in frames]),
-        charts.Bars("epipolar", [f.epipolar_px_median for f in frames]),
-    ]
+    residuals = {
+        "coordinates": [f.coordinate_px_median for f in frames],
+        "epipolar": [f.epipolar_px_median for f in frames],
+    }
     truth = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
     values = {
         "report": report,
@@ -265,36 +254,35 @@ def _main_figures(report: ReportInput) -> list[tuple[str, str, str]]:
     return [(f"{name}: {before}" if before else name, value, after) for name, (before, value, after) in named]
 
 
-def _parts(report: ReportInput) -> tuple[SurfacePictures, list[Comparison], "PoseChanges | None"]:
+def _parts(report: ReportInput) -> tuple[dict[str, Any], list[Comparison], dict[str, Any] | None]:
     """What takes long, side by side. Matplotlib's settings belong to the process: one task draws with it at a time."""
     surface = IndexedMesh(report.inputs.mesh)
     compare = partial(compare_frames, surface, report.inputs.scan, report.evaluation.agreement, report.inputs.poses)
     pictures_of, changes_of = partial(_surface_pictures, report, surface), partial(_pose_changes, report)
     tasks: list[Callable[[], Any]] = [pictures_of, changes_of, compare]
     (pictures, errors), changes, comparisons = results(tasks)
-    if errors is not None and pictures.scale is not None:
-        title, units = "Signed distance of the surface from the reference", report.evaluation.truth_units
-        histogram = charts.histogram(title, units, errors, pictures.scale.lower, pictures.scale.upper)
-        pictures = replace(pictures, histogram=histogram)
+    if errors is not None:
+        title, scale = "Signed distance of the surface from the reference", pictures["scale"]
+        shown = charts.histogram(title, report.evaluation.truth_units, errors, scale.lower, scale.upper)
+        pictures["histogram"] = shown
     return pictures, comparisons, changes
 
 
-def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[SurfacePictures, Float[ndarray, "n"] | None]:
-    """The pictures without the histogram, and the errors that it shows."""
+def _surface_pictures(report: ReportInput, surface: IndexedMesh) -> tuple[dict[str, Any], Float[ndarray, "n"] | None]:
+    """Shaded views of the surface, with error colours where there is a reference, and the errors of its histogram."""
     values, scale = _errors(report, surface, surface.vertices)
     colours = None if values is None or scale is None else scale(values)
     views = camera_views(report.inputs.poses.T_world_camera, surface.centre)
     units = report.evaluation.truth_units
     layers = [*colour_layers(values, scale, report.inputs.quality, report.evaluation.units, units), *report.layers]
-    quality = report.inputs.quality
-    sigma = None if quality is None else quality.sigma
+    sigma = None if report.inputs.quality is None else report.inputs.quality.sigma
     scan, record = report.inputs.scan, report.inputs.record
     numbers = {frame.name: k for k, frame in enumerate(scan.frames)}
     numbers |= {} if record is None else {frame.name: k for k, frame in enumerate(record.frames)}
     view = mesh_scene(surface, layers, scan, report.inputs.poses, numbers, sigma, report.inputs.colour)
     errors = None if scale is None else _errors(report, surface, surface.sample(50_000, 0)[0])[0]
-    drawn = [data_uri(render(surface, v, colours)) for v in views]
-    return SurfacePictures(drawn, view, scale, [layer.name for layer in layers], ""), errors
+    drawn, names = [data_uri(render(surface, v, colours)) for v in views], [layer.name for layer in layers]
+    return {"views": drawn, "view": view, "scale": scale, "layers": names, "histogram": ""}, errors
 
 
 def _errors(
@@ -310,18 +298,11 @@ def _errors(
     return reference.surface_errors(surface, score.S_truth_result, points), ColourScale("RdYlBu_r", -limit, limit)
 
 
-@dataclass(frozen=True)
-class PoseChanges:
-    """How far the evaluated poses are from the scan's own, and how certain they are."""
+def _pose_changes(report: ReportInput) -> dict[str, Any] | None:
+    """How far the evaluated poses are from the scan's own, how certain they are, and frames that have no place.
 
-    change: PoseErrors
-    sigma: list[PoseSigma | None]
-    unplaced: list[str]  # frames that do not agree with the others
-    charts: list[str]
-
-
-def _pose_changes(report: ReportInput) -> PoseChanges | None:
-    """None where the scan's own poses were evaluated."""
+    None where the scan's own poses were evaluated.
+    """
     if not report.poses_name:
         return None
     scan = report.inputs.scan
@@ -329,36 +310,27 @@ def _pose_changes(report: ReportInput) -> PoseChanges | None:
     sigma = report.inputs.pose_sigma if any(s is not None for s in report.inputs.pose_sigma) else []
     camera, projector = change.camera, change.projector
     figures = [
-        charts.frame_bars(title, unit, [charts.Bars("camera", list(c)), charts.Bars("projector", list(p))])
+        charts.frame_bars(title, unit, {"camera": list(c), "projector": list(p)})
         for title, unit, c, p in (
             ("Change of position by frame", scan.units, camera.translation, projector.translation),
             ("Change of rotation by frame", "degrees", camera.rotation_deg, projector.rotation_deg),
         )
     ]
     if sigma:
-        for title, unit, keys in (
-            ("Uncertainty of position (1 sigma) by frame", scan.units, ("camera_translation", "relative_translation")),
-            ("Uncertainty of rotation (1 sigma) by frame", "degrees", ("camera_rotation_deg", "relative_rotation_deg")),
+        for title, unit, key in (
+            ("Uncertainty of position (1 sigma) by frame", scan.units, "translation"),
+            ("Uncertainty of rotation (1 sigma) by frame", "degrees", "rotation_deg"),
         ):
-            labels = ("frame in the world", "projector relative to camera")
-            series = [
-                charts.Bars(label, [getattr(s, key) if s else math.nan for s in sigma])
-                for key, label in zip(keys, labels, strict=True)
-            ]
+            series = {
+                label: [getattr(s, f"{what}_{key}") if s else math.nan for s in sigma]
+                for what, label in (("camera", "frame in the world"), ("relative", "projector relative to camera"))
+            }
             figures.append(charts.frame_bars(title, unit, series))
-    return PoseChanges(change, sigma, report.inputs.unplaced, figures)
+    return {"change": change, "sigma": sigma, "unplaced": report.inputs.unplaced, "charts": figures}
 
 
-@dataclass(frozen=True)
-class TrainingSection:
+def _training(training: dict[str, Any] | None) -> dict[str, Any] | None:
     """Curves, settings and versions of the run."""
-
-    curves: list[str]
-    settings: list[tuple[str, str]]
-    versions: list[tuple[str, str]]
-
-
-def _training(training: dict[str, Any] | None) -> TrainingSection | None:
     if training is None:
         return None
     curves = {k: v for k, v in _dict(training.get("curves")).items() if isinstance(v, list) and len(v) > 0}
@@ -367,7 +339,7 @@ def _training(training: dict[str, Any] | None) -> TrainingSection | None:
         charts.curve(name, step if len(step) == len(values) else range(len(values)), values)
         for name, values in curves.items()
     ]
-    return TrainingSection(drawn, _flat(_dict(training.get("settings"))), _flat(_dict(training.get("versions"))))
+    return {"curves": drawn} | {key: _flat(_dict(training.get(key))) for key in ("settings", "versions")}
 
 
 def _dict(value: Any) -> dict[str, Any]:

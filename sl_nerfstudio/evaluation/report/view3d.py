@@ -26,6 +26,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.triangulation import OUTLINE, beside, frustum, world_pixels
 from sl_nerfstudio.late_imports import open3d as o3d
+from sl_nerfstudio.meshing.finish import simplified
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.processing.scan_poses import PlacedFrame, PlacedGroup
 from sl_nerfstudio.scan import Scan
@@ -45,21 +46,14 @@ def packed(values: ndarray, kind: str) -> str:
 
 
 @dataclass(frozen=True)
-class SeenAt:
-    """The pixel of a photograph in which each point of a surface was decoded."""
-
-    names: Sequence[str]  # of the frames
-    frame: Int[ndarray, "v"]  # index into the names; -1: no frame decoded it
-    uv: Float[ndarray, "v 2"]
-
-
-@dataclass(frozen=True)
 class ShownSurface:
     """Triangles, or discs where there are none, and what is known of their points."""
 
     points: Float64[ndarray, "v 3"]
     normals: Float64[ndarray, "v 3"]
-    seen: SeenAt
+    names: Sequence[str]  # of the frames
+    frame: Int[ndarray, "v"]  # in which each point was decoded, index into the names; -1: in none
+    uv: Float[ndarray, "v 2"]  # pixel of its photograph
     layers: Sequence[ColourLayer] = ()
     faces: Int[ndarray, "f 3"] | None = None
     radius: float = 0.0  # of the discs
@@ -108,9 +102,9 @@ def _group(
         "colour": None if surface.colour is None else packed(surface.colour, "u1"),
         "layers": [_layer(layer) for layer in surface.layers],
         "sigma": None if surface.sigma is None else packed(surface.sigma, "f4"),
-        "names": list(surface.seen.names),
-        "frame": packed(surface.seen.frame, "i2"),
-        "uv": packed(surface.seen.uv, "f4"),
+        "names": list(surface.names),
+        "frame": packed(surface.frame, "i2"),
+        "uv": packed(surface.uv, "f4"),
         "devices": [one.document(length, origin) for one in devices],
     }  # fmt: skip
 
@@ -162,20 +156,15 @@ def decimated(mesh: Mesh, most: int = MOST_TRIANGLES) -> tuple[Mesh, ndarray]:
     """The mesh reduced to about `most` triangles, and for each of its vertices the nearest one of the original."""
     if len(mesh.faces) <= most:
         return mesh, np.arange(len(mesh.vertices))
-    centre = mesh.vertices.mean(0)
-    size = float(np.ptp(mesh.vertices, axis=0).max()) or 1.0
-    plain = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector((mesh.vertices - centre) / size),
-        o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)),
-    )
-    if len(mesh.faces) > 5 * most:  # first a coarse pass: precise decimation of a million triangles takes 10 s
-        cell = float(np.sqrt(mesh.face_areas().sum() / most)) / size
-        plain = plain.simplify_vertex_clustering(cell, o3d.geometry.SimplificationContraction.Average)
-    small = plain.simplify_quadric_decimation(most)
-    vertices = np.asarray(small.vertices) * size + centre
-    used = np.unique(mesh.faces)
-    nearest = used[np.asarray(KDTree(mesh.vertices[used]).query(vertices)[1])]
-    return Mesh(vertices, np.asarray(small.triangles).astype(np.int64)), nearest
+
+    def simplify(plain: o3d.geometry.TriangleMesh) -> o3d.geometry.TriangleMesh:
+        if len(mesh.faces) > 5 * most:  # first a coarse pass: precise decimation of a million triangles takes 10 s
+            cell = float(np.sqrt(mesh.face_areas().sum() / most)) / float(np.ptp(mesh.vertices, axis=0).max())
+            plain = plain.simplify_vertex_clustering(cell, o3d.geometry.SimplificationContraction.Average)
+        return plain.simplify_quadric_decimation(most)
+
+    small, used = simplified(mesh, simplify), np.unique(mesh.faces)
+    return small, used[np.asarray(KDTree(mesh.vertices[used]).query(small.vertices)[1])]
 
 
 def mesh_scene(
@@ -192,11 +181,12 @@ def mesh_scene(
     `numbers` are the frames' places among all captures.
     """
     small, nearest = decimated(surface.mesh)
-    normals = surface.vertex_normals[nearest]
+    normals = surface.mesh.vertex_normals()[nearest]
     shown = ShownSurface(
         small.vertices,
         normals,
-        decoded_at(surface, small.vertices, normals, scan, poses),
+        [frame.name for frame in scan.frames],
+        *decoded_at(surface, small.vertices, normals, scan, poses),
         [ColourLayer(one.name, one.values[nearest], one.scale, one.units) for one in layers],
         small.faces,
         colour=None if colour is None else colour[nearest],
@@ -218,8 +208,11 @@ def decoded_at(
     normals: Float64[ndarray, "n 3"],
     scan: Scan,
     poses: DevicePoses,
-) -> SeenAt:
-    """Of the frames that see a point of the surface, and decoded the pixel, the one that looks at it most directly."""
+) -> tuple[Int[ndarray, "n"], Float64[ndarray, "n 2"]]:
+    """Of the frames that see a point of the surface, and decoded the pixel, the one that looks at it most directly.
+
+    Its number, -1 if there is none, and the pixel of its photograph.
+    """
     frame, uv, best = np.full(len(points), -1), np.zeros((len(points), 2)), np.zeros(len(points))
     for k, one in enumerate(scan.frames):
         T = poses.T_world_camera[k]
@@ -233,7 +226,7 @@ def decoded_at(
         seen = ~surface.occluded(points[left], T[:3, 3])
         left, pixel = left[seen], pixel[seen]
         frame[left], uv[left], best[left] = k, pixel, facing[left]
-    return SeenAt([one.name for one in scan.frames], frame, uv * scan.shrunk_by)
+    return frame, uv * scan.shrunk_by
 
 
 # The points of registered frames, one group of frames at a time.
@@ -285,9 +278,8 @@ def placed_surface(group: PlacedGroup, numbers: dict[str, int], shrink: int = 1)
     places = np.array([numbers[frame.name] for frame in frames])
     scale = ColourScale("turbo", float(places.min()), max(float(places.max()), places.min() + 1.0))
     layer = ColourLayer("frames", places[index].astype(np.float64), scale, "number of the frame")
-    return ShownSurface(
-        points, normals, SeenAt([frame.name for frame in frames], index, uv * shrink), [layer], radius=radius
-    )
+    names = [frame.name for frame in frames]
+    return ShownSurface(points, normals, names, index, uv * shrink, [layer], radius=radius)
 
 
 def _discs(points: Float64[ndarray, "n 3"], eyes: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, "n 3"], float]:
@@ -298,9 +290,8 @@ def _discs(points: Float64[ndarray, "n 3"], eyes: Float64[ndarray, "n 3"]) -> tu
     distance, near = KDTree(points).query(points, _NEIGHBOURS)
     offset = points[near] - points[near].mean(1, keepdims=True)
     normal = np.linalg.eigh(np.swapaxes(offset, 1, 2) @ offset)[1][:, :, 0]
-    return normal * np.where((normal * towards).sum(1) < 0, -1.0, 1.0)[:, None], _DISC * float(
-        np.median(distance[:, 8])
-    )
+    normal = normal * np.where((normal * towards).sum(1) < 0, -1.0, 1.0)[:, None]
+    return normal, _DISC * float(np.median(distance[:, 8]))
 
 
 def _group_name(group: PlacedGroup) -> str:

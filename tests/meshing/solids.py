@@ -1,0 +1,32 @@
+"""Meshes of known shape, and several of them as one."""
+
+import numpy as np
+import trimesh
+
+from sl_nerfstudio.meshing.mesh import Mesh
+
+
+def mesh_of(solid: trimesh.Trimesh, scale: float = 1.0) -> Mesh:
+    """A mesh of trimesh as ours."""
+    return Mesh(np.asarray(solid.vertices, dtype=np.float64) * scale, np.asarray(solid.faces, dtype=np.int64))
+
+
+def together(*parts: Mesh) -> Mesh:
+    """All parts as one mesh, their vertices in the order of the parts."""
+    offsets = np.cumsum([0, *(len(p.vertices) for p in parts)])[:-1]
+    faces = [p.faces + offset for p, offset in zip(parts, offsets, strict=True)]
+    return Mesh(np.concatenate([p.vertices for p in parts]), np.concatenate(faces))
+
+
+def plate(half: float, cell: float, z: float = 0.0) -> Mesh:
+    """A square at a height z, seen from above."""
+    n = int(2 * half / cell) + 1
+    x, y = np.meshgrid(np.linspace(-half, half, n), np.linspace(-half, half, n))
+    i = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1, 1)
+    faces = np.concatenate([i + np.array([0, 1, n]), i + np.array([1, n + 1, n])])
+    return Mesh(np.stack([x.ravel(), y.ravel(), np.full(n * n, z)], 1), faces)
+
+
+def triangles_at_edges(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """All edges (e, 2), each once, and how many triangles each has."""
+    return np.unique(np.sort(mesh.edges(), axis=1), axis=0, return_counts=True)
