@@ -4,7 +4,6 @@ import io
 import json
 import mmap
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -35,7 +34,7 @@ from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.storage import in_file
 from tests.decoding.ramps_decoder import RampsDecoder
 from tests.processing.conftest import register_ramps
-from tests.processing.ramp_scan import LAYOUT, NAMES, RampScan
+from tests.processing.ramp_scan import LAYOUT, NAMES
 
 
 class KilledDecoder(RampsDecoder):
@@ -43,13 +42,6 @@ class KilledDecoder(RampsDecoder):
 
     def decode(self, images, names):
         os._exit(9)
-
-
-@pytest.fixture
-def copy(ramp_scan, tmp_path):
-    """Captures that a test may spoil."""
-    shutil.copytree(ramp_scan.root, tmp_path / "c")
-    return RampScan(tmp_path / "c", *list(vars(ramp_scan).values())[1:])
 
 
 def _found(scan):
@@ -193,9 +185,8 @@ def test_clouds_that_do_not_fit_into_memory_give_the_same_scan(monkeypatch, whol
     assert len(found) == 2 * len(NAMES) + 1 and found == expected
 
 
-def test_clouds_stay_in_memory_up_to_a_limit(ramp_scan, tmp_path):
-    worker = FrameWorker(ramp_scan.job(tmp_path))
-    clouds = clouds_of([worker(frame) for frame in _found(ramp_scan).frames])
+def test_clouds_stay_in_memory_up_to_a_limit(results):
+    clouds = clouds_of(results)
     size = sum(array.nbytes for array in (clouds[0].points, clouds[0].coords))
     kept = records.LargeClouds(6 * size)
     same = [kept.kept(cloud) for cloud in clouds]

@@ -7,10 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
-from sl_nerfstudio.processing.captures import CapturedFrame, find_captures
+from sl_nerfstudio.processing.captures import CapturedFrame
 from sl_nerfstudio.processing.consistency import compare_registered
-from sl_nerfstudio.processing.frames import FrameStageResult, FrameWorker, clouds_of
+from sl_nerfstudio.processing.frames import FrameStageResult, clouds_of
 from sl_nerfstudio.processing.result import (
     EdgeRecord,
     FrameRecord,
@@ -22,8 +21,7 @@ from sl_nerfstudio.processing.result import (
     unconnected_neighbours,
     what_to_recapture,
 )
-from sl_nerfstudio.processing.scan_poses import find_scan_poses, stated_scale
-from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.processing.scan_poses import stated_scale
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     Exclusion,
@@ -41,26 +39,8 @@ from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind, e
 from sl_nerfstudio.review.agreement import SurfaceShares
 from sl_nerfstudio.scan import PickedPixel, Scale
 from tests.formulas import pixels
-from tests.processing.conftest import SHORT
 from tests.processing.ramp_scan import NAMES
 from tests.relative_pose.two_views import view
-
-
-@pytest.fixture(scope="module")
-def results(ramp_scan, tmp_path_factory):
-    worker = FrameWorker(ramp_scan.job(tmp_path_factory.mktemp("w")))
-    return [worker(frame) for frame in find_captures(ramp_scan.root / "images", True).frames]
-
-
-@pytest.fixture(scope="module")
-def registration(results):
-    return register(clouds_of(results))
-
-
-@pytest.fixture(scope="module")
-def poses(results, registration):
-    clouds = clouds_of(results)
-    return find_scan_poses(clouds, registration, adjust_registered(clouds, registration, SHORT), None, None)
 
 
 @pytest.fixture
@@ -202,22 +182,20 @@ def test_residuals_that_do_not_exist_are_left_out(config, results, registration,
     assert result.joint_px is None and result.document()["joint_adjustment_px"] is None
 
 
-def _frame(name, **values):
-    return FrameRecord(name, **values)
-
-
 def _edge(a, b, used=True):
     return EdgeRecord((a, b), 0.5, 0.9, used, False)
 
 
 def test_every_reason_is_named():
     frames = [
-        _frame("a", decode_rate=0.3, mask_share=0.4, fitness=0.95),
-        _frame("b", in_scan=False, stage="decoding", reason="b.png: is black\n    cause:  dark\n    remedy: light"),
-        _frame("c", decode_rate=0.9, mask_share=0.01, degeneracies=("all points lie in one plane",)),
-        _frame("d", decode_rate=0.9, mask_share=0.5, fitness=0.4),
-        _frame("e", decode_rate=0.9, shared_decoded=0.5),
-        _frame("f", decode_rate=0.1, shared_decoded=0.9),  # background that no frame decoded
+        FrameRecord("a", decode_rate=0.3, mask_share=0.4, fitness=0.95),
+        FrameRecord(
+            "b", in_scan=False, stage="decoding", reason="b.png: is black\n    cause:  dark\n    remedy: light"
+        ),
+        FrameRecord("c", decode_rate=0.9, mask_share=0.01, degeneracies=("all points lie in one plane",)),
+        FrameRecord("d", decode_rate=0.9, mask_share=0.5, fitness=0.4),
+        FrameRecord("e", decode_rate=0.9, shared_decoded=0.5),
+        FrameRecord("f", decode_rate=0.1, shared_decoded=0.9),  # background that no frame decoded
     ]
     said = what_to_recapture(frames, [_edge("a", "c"), _edge("c", "d", used=False)], ordered=True)
     assert said[0] == "b: capture it again; it was left out (b.png: is black)"
@@ -230,7 +208,7 @@ def test_every_reason_is_named():
 
 
 def test_unordered_frames_with_a_single_connection():
-    frames = [_frame(n) for n in "abcd"]
+    frames = [FrameRecord(n) for n in "abcd"]
     edges = [_edge("a", "b"), _edge("b", "c"), _edge("c", "a"), _edge("c", "d")]
     said = what_to_recapture(frames, edges, ordered=False)
     assert said == ("near d: add a frame; only one other frame overlaps it",)
@@ -238,9 +216,10 @@ def test_unordered_frames_with_a_single_connection():
 
 def test_frames_of_one_group_share_a_sentence():
     apart = {"in_scan": False, "stage": "registering", "reason": "it may slip\n    cause:  round"}
-    frames = [_frame("a", component=0), _frame("b", **apart, component=2), _frame("c", **apart, component=-1),
-              _frame("d", **apart, component=2), _frame("e", component=0),
-              _frame("f", **{**apart, "reason": "it is dark"}), _frame("g", **apart)]  # fmt: skip
+    kinds = {"a": {"component": 0}, "b": {**apart, "component": 2}, "c": {**apart, "component": -1},
+             "d": {**apart, "component": 2}, "e": {"component": 0}, "f": {**apart, "reason": "it is dark"},
+             "g": apart}  # fmt: skip
+    frames = [FrameRecord(name, **values) for name, values in kinds.items()]
     assert what_to_recapture(frames, [_edge("a", "e")], ordered=True) == (
         "b, d: capture views that connect this group 2 with the scan; b was left out (it may slip)",
         "c, g: capture them again; each was left out (it may slip)",
@@ -260,7 +239,7 @@ def test_the_figures_that_a_frame_has_fit_their_sentences():
     assert {"pure rotation", "planar", "epipole in view"} <= kinds
 
 
-def test_a_baseline_is_stated_by_the_name_of_its_frame():
+def test_a_baseline_is_stated_by_the_name_of_itsFrameRecord():
     found = stated_scale(KnownLength(0.085, "mm", ("IMG 7",)))
     assert found == Scale(True, "baseline of frame IMG 7", baseline_of="IMG 7")
 
