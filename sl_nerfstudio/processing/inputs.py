@@ -240,10 +240,6 @@ class CaptureNotes:
     shrink: int = 1  # squares of so many pixels of the photographs are read as one
     camera: dict[str, Any] | None = None  # figures of a camera that no file describes
 
-    def with_camera(self, sentence: str, figures: dict[str, Any]) -> "CaptureNotes":
-        """Add what is known of a camera that no file describes."""
-        return replace(self, sentences=(*self.sentences, sentence), camera=figures)
-
     def document(self) -> dict[str, Any]:
         """Return the figures as JSON."""
         video = None if self.video is None else self.video.document()

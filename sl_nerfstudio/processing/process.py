@@ -302,7 +302,8 @@ class _Run:
         job, results, camera = refine_camera(frames.job, frames.results, start, self.log)
         results = run_frame_stage_again(self.config, job, self.inputs.captures, results)
         self._require_clouds(results)
-        notes = self.inputs.notes.with_camera(camera.sentence(), camera.document())
+        notes = self.inputs.notes
+        notes = replace(notes, sentences=(*notes.sentences, camera.sentence()), camera=camera.document())
         return replace(frames, job=job, results=results, notes=notes)
 
     def _require_clouds(self, results: Sequence[FrameStageResult]) -> None:

@@ -71,21 +71,19 @@ class ScanWriter:
         if pattern.shape != (projector.h, projector.w):
             raise ValueError(f"the pattern is {pattern.shape}, the projector {(projector.h, projector.w)}")
         self.root = root = Path(root)
-        self._camera = camera
-        self._projector = projector
+        self._camera, self._scale = camera, scale
         self._head: dict[str, Any] = {
             "sl_format": FORMAT,
             "units": units,
             **(device_fields(camera, "camera_model") if camera else {}),
+            "projector": {
+                **device_fields(projector, "model"),
+                "pattern_path": "pattern.png",
+                **(projector_extra or {}),
+            },
+            "scale": scale_record(scale),
+            **(extra or {}),
         }
-        self._head["projector"] = {
-            **device_fields(projector, "model"),
-            "pattern_path": "pattern.png",
-            **(projector_extra or {}),
-        }
-        self._head["scale"] = scale_record(scale)
-        self._scale = scale
-        self._head.update(extra or {})
         self._frames: list[dict[str, Any]] = []
         self._truth: list[dict[str, Any]] = []
         self._folder, self._own = within or NewFolder(root), within is None
@@ -143,11 +141,8 @@ class ScanWriter:
         device = camera or self._camera
         if device is None:
             raise ValueError("a frame needs its own camera if there are no common intrinsics")
-        if (
-            any(f["file_path"] == f"images/{name}.png" for f in self._frames)
-            or name in ("", ".", "..")
-            or Path(name).name != name
-        ):
+        twice = any(frame["file_path"] == f"images/{name}.png" for frame in self._frames)
+        if twice or name in ("", ".", "..") or Path(name).name != name:
             raise ValueError(f"frame name {name!r} was given before or is not a file name")
         arrays = {"image": image, "coords": coords, "pattern": pattern, "mask": mask, "color": color}
         for what, array in arrays.items():

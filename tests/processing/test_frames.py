@@ -72,8 +72,7 @@ def whole(ramp_scan, tmp_path_factory):
 @pytest.mark.slow
 def test_a_third_decoder_goes_all_the_way_to_a_scan(whole, ramp_scan):
     out, said = whole
-    assert "decoder ramps" in said
-    assert check_scan(out) == []
+    assert "decoder ramps" in said and check_scan(out) == []
     scan = read_scan(out)
     assert [frame.name for frame in scan.frames] == list(NAMES)
     for frame, exact in zip(scan.frames, ramp_scan.coords, strict=True):
@@ -83,9 +82,7 @@ def test_a_third_decoder_goes_all_the_way_to_a_scan(whole, ramp_scan):
         assert np.abs(coords[both] - exact[both]).max() < 800 / 65535
     assert json.loads((out / "pattern.json").read_text())["kind"] == "ramps"
     np.testing.assert_allclose(scan.read_pattern(), LAYOUT.render(), atol=0.6 / 255)
-    document = json.loads((out / "processing.json").read_text())
-    assert document["decoder"] == "ramps"
-    assert [frame["decode_rate"] for frame in document["frames"]] == [1.0] * 4
+    assert json.loads((out / "processing.json").read_text())["decoder"] == "ramps"
 
 
 def test_results_say_how_much_was_decoded_and_come_from_the_store_the_second_time(ramp_scan, tmp_path):
@@ -103,14 +100,6 @@ def test_results_say_how_much_was_decoded_and_come_from_the_store_the_second_tim
     assert "4 of 4 frames (4 had been decoded before): 100%" in describe_frame_stage(second)
     frames = json.loads((tmp_path / "w" / "manifest.json").read_text())["frames"]
     assert {name: frame["status"] for name, frame in frames.items()} == dict.fromkeys(NAMES, "decoded before")
-
-
-def test_a_changed_image_is_decoded_again(copy, tmp_path):
-    worker, frame = FrameWorker(copy.job(tmp_path / "w")), _found(copy).frames[0]
-    first = worker(frame)
-    frame.images[0].write_bytes(frame.images[0].read_bytes() + b" ")
-    again = worker(frame)
-    assert again.key != first.key and not again.resumed and worker(frame).resumed
 
 
 def test_frames_that_fail_are_named_with_their_file_and_the_others_go_on(copy, tmp_path):

@@ -44,16 +44,14 @@ from tests.relative_pose.two_views import view
 
 
 @pytest.fixture
-def config(ramp_scan, tmp_path):
-    return ramp_scan.config(tmp_path)
+def summary(ramp_scan, tmp_path, results, registration, poses):
+    """Summarises the run, of which something may be otherwise."""
+    found = {"results": results, "registration": registration, "poses": poses}
+    return lambda **changes: summarise(ramp_scan.config(tmp_path), "ramps", **{**found, **changes})
 
 
-def _lost(stage, reason="x.png: is bad\n    cause:  a\n    remedy: b"):
-    return FrameStageResult(CapturedFrame("lost", ()), "k", False, 0.5, 0.25, None, stage, reason)
-
-
-def test_registered_frames_have_all_figures(config, results, registration, poses):
-    result = summarise(config, "ramps", results, registration, poses)
+def test_registered_frames_have_all_figures(summary, results):
+    result = summary()
     assert result.registered == 4 and result.decoder == "ramps"
     assert (result.units, result.scale_source) == ("arbitrary", "")
     baselines = [frame.baseline for frame in result.frames]
@@ -77,35 +75,34 @@ def test_registered_frames_have_all_figures(config, results, registration, poses
 SHARES = [SurfaceShares(0.9, 0.0), SurfaceShares(0.8, 0.01), SurfaceShares(None, None), SurfaceShares(0.7, 0.02)]
 
 
-def test_coordinates_of_the_other_frames_are_part_of_the_record(config, results, registration, poses):
+def test_coordinates_of_the_other_frames_are_part_of_the_record(summary, results, registration, poses):
     cross = compare_registered(clouds_of(results), registration, poses.adjusted)
-    result = summarise(config, "ramps", results, registration, poses, cross, SHARES)
+    result = summary(cross=cross, shares=SHARES)
     assert [frame.shared_decoded for frame in result.frames] == [0.9, 0.8, None, 0.7]
     assert [frame.missing_share for frame in result.frames] == [0.0, 0.01, None, 0.02]
-    assert (
-        result.verdict.band == "good" and result.document()["verdict"] == "good" and result.document()["reasons"] == []
-    )
+    document = result.document()
+    assert (result.verdict.band, document["verdict"], document["reasons"]) == ("good", "good", [])
     for frame, found in zip(result.frames, cross.frames, strict=True):
         assert (frame.seen_share, frame.cross_share, frame.cross_px_p95) == (found.seen, found.share, found.px_p95)
         assert found.share > 0.95
     assert result.cross_px == (cross.px_median, cross.px_p95)
 
 
-def test_an_undecided_frame_keeps_the_scan_from_being_good_and_its_sigma_says_so(config, results, registration, poses):
+def test_an_undecided_frame_keeps_the_scan_from_being_good_and_its_sigma_says_so(summary, registration):
     doubts = (UncertainRotation(NAMES[1], 7.5), UncertainRotation(NAMES[2], 2.0))
-    result = summarise(config, "ramps", results, replace(registration, uncertainties=doubts), poses)
+    result = summary(registration=replace(registration, uncertainties=doubts))
     assert result.verdict.band == "poor"
     assert result.verdict.reasons[0].startswith(f"{NAMES[1]}: rotation known only to 7.5 degrees")
     assert result.frames[1].sigma_rotation_deg == 7.5
     assert [frame.undecided for frame in result.frames] == [False, True, True, False]
     assert result.document()["frames"][1]["undecided"] is True
-    one = summarise(config, "ramps", results, replace(registration, uncertainties=doubts[1:]), poses)
+    one = summary(registration=replace(registration, uncertainties=doubts[1:]))
     assert one.verdict.band == "acceptable" and NAMES[2] in one.verdict.reasons[0]
 
 
-def test_placed_points_are_where_both_devices_see_them(config, results, registration, poses):
+def test_placed_points_are_where_both_devices_see_them(summary, results, poses):
     """Projected by hand: into the camera they are the pixels' centres, into the projector the decoded coordinates."""
-    (group,) = summarise(config, "ramps", results, registration, poses).placed
+    (group,) = summary().placed
     assert group.component == 0 and [frame.name for frame in group.frames] == list(NAMES)
     clouds = clouds_of(results)
     for k, frame in enumerate(group.frames):
@@ -118,7 +115,7 @@ def test_placed_points_are_where_both_devices_see_them(config, results, registra
         assert np.median(off) < 0.1 and off.max() < 1
 
 
-def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, results, registration, poses):
+def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(summary, results, registration):
     T = np.stack([np.eye(4), np.eye(4)])
     T[1, :3, 3] = [1.0, 2.0, 3.0]
     apart = replace(
@@ -128,7 +125,7 @@ def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, 
         exclusions=tuple(NoCommonSurface(name) for name in NAMES[2:]),
         separate=(SeparatePoses(tuple(NAMES[2:]), T, np.array([0.5, 2.0])),),
     )
-    scan, other = summarise(config, "ramps", results, apart, poses).placed
+    scan, other = summary(registration=apart).placed
     assert (scan.component, other.component) == (0, 1)
     assert [[f.name for f in g.frames] for g in (scan, other)] == [list(NAMES[:2]), list(NAMES[2:])]
     for k, frame in enumerate(other.frames):
@@ -136,10 +133,10 @@ def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, 
         baseline = np.linalg.norm(frame.T_world_projector[:3, 3] - T[k, :3, 3])
         assert baseline == pytest.approx((0.5, 2.0)[k])
         np.testing.assert_allclose(pixels(frame.camera, T[k], frame.points), frame.uv_camera, atol=0.1)
-    alone = summarise(config, "ramps", results, replace(apart, separate=()), poses).placed
+    alone = summary(registration=replace(apart, separate=())).placed
     assert [(g.component, len(g.frames)) for g in alone] == [(0, 2), (-1, 1), (-1, 1)]
     assert [g.frames[0].name for g in alone[1:]] == list(NAMES[2:])
-    nowhere = summarise(config, "ramps", results, None, None).placed  # registration was not reached
+    nowhere = summary(registration=None, poses=None).placed  # registration was not reached
     assert [g.component for g in nowhere] == [-1] * 4
     part = np.zeros(clouds_of(results)[0].coords.shape[:2], np.uint8)
     assert not len(scan.only_object({NAMES[0]: part}).frames[0].points)  # nothing of it is the object
@@ -149,36 +146,35 @@ def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, 
 @pytest.mark.parametrize(
     ("stage", "rate", "share"), [("reading", None, None), ("decoding", None, None), ("calibrating", 0.5, 0.25)]
 )
-def test_a_frame_that_failed_has_only_the_figures_that_were_reached(
-    config, results, registration, poses, stage, rate, share
-):
-    lost = _lost(stage)
-    frame = summarise(config, "ramps", [lost, *results], registration, poses).frames[0]
+def test_a_frame_that_failed_has_only_the_figures_that_were_reached(summary, results, registration, stage, rate, share):
+    reason = "x.png: is bad\n    cause:  a\n    remedy: b"
+    lost = FrameStageResult(CapturedFrame("lost", ()), "k", False, 0.5, 0.25, None, stage, reason)
+    frame = summary(results=[lost, *results]).frames[0]
     assert (frame.in_scan, frame.stage, frame.reason) == (False, stage, lost.reason)
     assert (frame.decode_rate, frame.mask_share) == (rate, share)
     assert frame.epipolar_px is frame.baseline is frame.fitness is None
     assert left_out(lost, registration) == (stage, lost.reason)
 
 
-def test_a_frame_that_was_not_registered_says_why(config, results, registration, poses):
+def test_a_frame_that_was_not_registered_says_why(summary, results, registration):
     alone = NoCommonSurface(NAMES[2])
     without = replace(registration, registered=np.array([True, True, False, True]), exclusions=(alone,))
-    frame = summarise(config, "ramps", results, without, poses).frames[2]
+    frame = summary(registration=without).frames[2]
     assert (frame.in_scan, frame.stage, frame.reason) == (False, "registering", exclusion_sentence(alone))
     assert vars(frame)["epipolar_px"] < 0.01 and frame.baseline is None and frame.fitness is None
     assert left_out(results[0], without) is None
 
 
 @pytest.mark.parametrize("registered", [False, True])
-def test_without_a_scan_every_frame_is_left_out_for_a_reason(config, results, registration, registered):
-    result = summarise(config, "ramps", results, registration if registered else None, None)
+def test_without_a_scan_every_frame_is_left_out_for_a_reason(summary, registration, registered):
+    result = summary(registration=registration if registered else None, poses=None)
     assert result.registered == 0 and result.joint_px is None and result.units == "arbitrary"
     assert {(f.stage, f.reason) for f in result.frames} == {("registering", "too few other frames could be used")}
 
 
-def test_residuals_that_do_not_exist_are_left_out(config, results, registration, poses):
+def test_residuals_that_do_not_exist_are_left_out(summary, poses):
     none = replace(poses, adjusted=replace(poses.adjusted, median_before_px=np.nan, median_after_px=np.nan))
-    result = summarise(config, "ramps", results, registration, none)
+    result = summary(poses=none)
     assert result.joint_px is None and result.document()["joint_adjustment_px"] is None
 
 
