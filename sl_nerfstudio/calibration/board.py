@@ -44,7 +44,7 @@ from sl_nerfstudio.calibration.board_adjustment import (
     residuals,
     sightings,
 )
-from sl_nerfstudio.geometry.devices import DEVICE_FIELDS, PARAMETERS, Device, DeviceKind, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.devices import PARAMETERS, Device, DeviceKind, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
 from sl_nerfstudio.pattern.boards import Board, Chessboard
 
@@ -291,12 +291,9 @@ def coverage_of(adjusted: AdjustedBoard, views: Sequence[BoardView]) -> Coverage
     normals, distance = rig.T_camera_board[:, :3, 2], np.linalg.norm(rig.T_camera_board[:, :3, 3], axis=1)
     tilt = np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1).min()))
     in_pattern = [view.projector for view in views if view.projector is not None]
-    return Coverage(
-        float(tilt),
-        float(distance.max() / distance.min()),
-        _filled([view.camera for view in views], rig.camera),
-        None if rig.projector is None else _filled(in_pattern, rig.projector),
-    )
+    camera = _filled([view.camera for view in views], rig.camera)
+    projector = None if rig.projector is None else _filled(in_pattern, rig.projector)
+    return Coverage(float(tilt), float(distance.max() / distance.min()), camera, projector)
 
 
 def _filled(corners: Sequence[Corners], device: Device) -> float:
@@ -310,16 +307,14 @@ def _filled(corners: Sequence[Corners], device: Device) -> float:
 
 def next_pose(adjusted: AdjustedBoard, p_board: Float64[ndarray, "m 3"]) -> NextPose | None:
     """Tried out on boards in many places: what the corners of each would add. None if no board fits the images."""
-    best: tuple[float, NextPose] | None = None
-    before = _relative_sigma(adjusted, adjusted.information)
+    _, before = _relative_sigma(adjusted, adjusted.information)
+    found: list[tuple[float, NextPose]] = []
     for words, T in _boards(adjusted.rig, p_board):
         information = _added(adjusted, T, p_board)
-        if information is None:
-            continue
-        score, focal = _relative_sigma(adjusted, adjusted.information + information)
-        if best is None or score < best[0]:
-            best = (score, NextPose(*words, focal, before[1]))
-    return None if best is None else best[1]
+        if information is not None:
+            score, focal = _relative_sigma(adjusted, adjusted.information + information)
+            found.append((score, NextPose(*words, focal, before)))
+    return min(found, key=lambda one: one[0])[1] if found else None
 
 
 def _boards(rig: BoardRig, p_board: Float64[ndarray, "m 3"]) -> Iterator[tuple[tuple[str, str, str, str], ndarray]]:
@@ -442,10 +437,11 @@ def encode_calibration(found: BoardCalibration, verdict: str, reasons: tuple[str
     """Encode a calibration as the JSON that sl-process reads."""
     document: dict[str, Any] = {"sl_calibration": 1, "units": "mm", "verdict": verdict, "reasons": list(reasons)}
     for name, device, sigma in zip(("camera", "projector"), found.adjusted.rig.devices, found.sigmas, strict=False):
-        document[name] = _device(device, sigma)
+        document[name] = {**asdict(device), "sigma": {key: value for key, value in sigma.values.items() if value}}
     if found.projector is not None:
         document["T_projector_camera"] = found.adjusted.rig.T_projector_camera.tolist()
-    document["board"] = _board(found.board)
+    kind = "chessboard" if isinstance(found.board, Chessboard) else "charuco"
+    document["board"] = {"kind": kind, **asdict(found.board)}
     document["rms_px"] = list(found.rms_px)
     document["left_out_px"] = list(found.left_out.error_px)
     document["poses"] = [
@@ -458,13 +454,3 @@ def encode_calibration(found: BoardCalibration, verdict: str, reasons: tuple[str
 
 def _rms(residuals: np.ndarray) -> float | None:
     return float(np.sqrt((residuals**2).mean())) if len(residuals) else None
-
-
-def _device(device: Device, sigma: DeviceSigma) -> dict[str, Any]:
-    fields = {key: getattr(device, key) for key in DEVICE_FIELDS}
-    return {**fields, "sigma": {key: value for key, value in sigma.values.items() if value}}
-
-
-def _board(board: Board) -> dict[str, Any]:
-    kind = "chessboard" if isinstance(board, Chessboard) else "charuco"
-    return {"kind": kind, **asdict(board)}

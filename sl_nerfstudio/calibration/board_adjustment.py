@@ -16,7 +16,17 @@ import torch
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import MODELS, PARAMETERS, Device, DeviceKind, Intrinsics, project, project_jacobian
+from sl_nerfstudio.calibration.formats import lens_slopes
+from sl_nerfstudio.geometry.devices import (
+    MODELS,
+    PARAMETERS,
+    Device,
+    DeviceKind,
+    Intrinsics,
+    distort,
+    project,
+    project_jacobian,
+)
 from sl_nerfstudio.geometry.least_squares import BlockEquations, minimise
 from sl_nerfstudio.geometry.lie import exp_se3, hat
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
@@ -88,19 +98,9 @@ class BoardRig:
         """The camera, and the projector if there is one."""
         return (self.camera,) if self.projector is None else (self.camera, self.projector)
 
-    def with_devices(self, devices: Sequence[Device]) -> "BoardRig":
-        """The rig with other intrinsics."""
-        camera, *others = devices
-        return replace(self, camera=camera, projector=others[0] if others else None)
-
     def only(self, views: Sequence[int]) -> "BoardRig":
         """The rig with the boards of some views."""
         return replace(self, T_camera_board=self.T_camera_board[list(views)])
-
-
-def with_numbers(device: Device, values: Float64[ndarray, "8"]) -> Device:
-    """A device with other PARAMETERS."""
-    return replace(device, **dict(zip(PARAMETERS, map(float, values), strict=True)))
 
 
 def board_points(corners: Float64[ndarray, "n 2"]) -> Float64[ndarray, "n 3"]:
@@ -186,15 +186,11 @@ def _by_twist(p: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3 6"]:
 def _by_parameters(device: Device, p: torch.Tensor) -> Float64[ndarray, "n 2 8"]:
     """Derivatives of pixels by PARAMETERS."""
     x, y, _, _ = (t.numpy() for t in MODELS[device.model].jacobian(p))
-    r2 = x * x + y * y
     o, one = np.zeros_like(x), np.ones_like(x)
-    radial = 1 + r2 * (device.k1 + r2 * device.k2)
-    xd = x * radial + 2 * device.p1 * x * y + device.p2 * (r2 + 2 * x * x)
-    yd = y * radial + device.p1 * (r2 + 2 * y * y) + 2 * device.p2 * x * y
-    lens_x = np.stack([x * r2, x * r2 * r2, 2 * x * y, r2 + 2 * x * x], -1) * device.fl_x
-    lens_y = np.stack([y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * x * y], -1) * device.fl_y
-    u = np.concatenate([np.stack([xd, o, one, o], -1), lens_x], -1)
-    v = np.concatenate([np.stack([o, yd, o, one], -1), lens_y], -1)
+    xd, yd = distort(x, y, device.k1, device.k2, device.p1, device.p2)
+    lens_x, lens_y = lens_slopes(x, y)
+    u = np.concatenate([np.stack([xd, o, one, o], -1), lens_x * device.fl_x], -1)
+    v = np.concatenate([np.stack([o, yd, o, one], -1), lens_y * device.fl_y], -1)
     return np.stack([u, v], 1)
 
 
@@ -306,13 +302,14 @@ def moved(rig: BoardRig, free: Free, shared: Float64[ndarray, "s"], boards: Floa
     devices, place = [], 0
     for device, one in zip(rig.devices, free, strict=True):
         columns = one.columns()
-        devices.append(with_numbers(device, device.parameters + columns @ shared[place : place + columns.shape[1]]))
+        values = device.parameters + columns @ shared[place : place + columns.shape[1]]
+        devices.append(replace(device, **dict(zip(PARAMETERS, values.tolist(), strict=True))))
         place += columns.shape[1]
     T_projector_camera = rig.T_projector_camera
     if len(free) == 2:
         T_projector_camera = _exp(shared[None, -6:])[0] @ T_projector_camera
     T_camera_board = _exp(boards) @ rig.T_camera_board
-    return replace(rig.with_devices(devices), T_camera_board=T_camera_board, T_projector_camera=T_projector_camera)
+    return BoardRig(devices[0], devices[1] if len(devices) > 1 else None, T_camera_board, T_projector_camera)
 
 
 def _exp(twists: Float64[ndarray, "n 6"]) -> Float64[ndarray, "n 4 4"]:

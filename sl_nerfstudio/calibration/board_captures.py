@@ -19,7 +19,7 @@ from sl_nerfstudio.pattern.boards import Board, CharucoBoard, Chessboard
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import ShownImage
 from sl_nerfstudio.scan.document import FileError
-from sl_nerfstudio.scan.images import Pixels, as_grey, read_photograph, shrunk
+from sl_nerfstudio.scan.images import as_grey, read_photograph, shrunk
 
 LEAST_IN_PATTERN = 8  # corners of a view that the pattern must reach
 Track = Callable[[Sequence[Any], str], Iterable[Any]]
@@ -98,22 +98,23 @@ class _Unused(Exception):
 def _read_pose(
     pose: BoardPhotographs, board: Board, decoder: Decoder[Any] | None
 ) -> tuple[Float32[ndarray, "h w"], Corners, BoardView, tuple[str, ...]]:
-    pattern, grey = (
-        _pattern_and_plain(pose) if isinstance(decoder, NetworkDecoder) else (None, _even_light(pose, decoder))
-    )
+    pattern = None
+    if isinstance(decoder, NetworkDecoder):
+        pattern, grey = _pattern_and_plain(pose)
+    else:
+        grey = _even_light(pose, decoder)
     corners = find_corners(grey, board)
     if corners is None:
         raise _Unused(_not_found(pose, grey, board), grey)
     if decoder is None:
         return grey, corners, BoardView(pose.name, corners, None), ()
     folder, factor = pose.images[0].parent, 1
-    images: list[Pixels] = []
     if pattern is None:
-        images += [read_photograph(path) for path in pose.images]
+        images = [read_photograph(path) for path in pose.images]
     else:
         white = without_reflectance(pattern, grey)
         factor = decoder.shrink_factor(white) or 1
-        images.append(shrunk(white, factor))
+        images = [shrunk(white, factor)]
     try:
         decoded = decoder.decode(images, [path.name for path in pose.images])
     except DecodingError as error:

@@ -59,14 +59,21 @@ def reduce_distortion(
         return (full[0], full[1], full[2], full[3]), 0.0
     x, y = _normalised_grid(full, matrix, size)
     xd, yd = _distort(x, y, full)
-    r2 = x * x + y * y
-    rows_x = np.stack([x * r2, x * r2 * r2, 2 * x * y, r2 + 2 * x * x], -1)
-    rows_y = np.stack([y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * x * y], -1)
+    rows_x, rows_y = lens_slopes(x, y)
     A = np.concatenate([matrix[0, 0] * rows_x, matrix[1, 1] * rows_y])
     b = np.concatenate([matrix[0, 0] * (xd - x), matrix[1, 1] * (yd - y)])
     k = np.linalg.lstsq(A, b, rcond=None)[0]
     miss = (A @ k - b).reshape(2, -1)
     return (float(k[0]), float(k[1]), float(k[2]), float(k[3])), float(np.hypot(*miss).max())
+
+
+def lens_slopes(
+    x: Float64[ndarray, "n"], y: Float64[ndarray, "n"]
+) -> tuple[Float64[ndarray, "n 4"], Float64[ndarray, "n 4"]]:
+    """Derivatives of distorted normalised coordinates, x and y, by k1, k2, p1, p2."""
+    r2 = x * x + y * y
+    rows_x = np.stack([x * r2, x * r2 * r2, 2 * x * y, r2 + 2 * x * x], -1)
+    return rows_x, np.stack([y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * x * y], -1)
 
 
 def _normalised_grid(
@@ -181,12 +188,11 @@ def opencv_entry(
 ) -> DeviceEntry:
     """One device from its matrix and lens terms; `offset` is added to the principal point. Raises FileError."""
     K, k = _numbers(matrix), np.zeros(4) if lens is None else _numbers(lens)
+    again = "calibrate again"
     if K is None or K.shape != (3, 3) or not np.isfinite(K).all():
-        raise FileError(path, f"{label}: is no 3 x 3 matrix of numbers", "a failed calibration", "calibrate again")
+        raise FileError(path, f"{label}: is no 3 x 3 matrix of numbers", "a failed calibration", again)
     if k is None or not np.isfinite(k).all():
-        raise FileError(
-            path, f"{label}: the lens terms are not numbers", "a failed calibration, or a slip", "calibrate again"
-        )
+        raise FileError(path, f"{label}: the lens terms are not numbers", "a failed calibration, or a slip", again)
     k = k.reshape(-1)
     if k.size not in (4, 5, 8, 12, 14):
         raise FileError(
@@ -265,18 +271,15 @@ def read_json_entries(path: Path) -> list[DeviceEntry]:
     offset = 0.5 - (top.read_number("pixel_centre", 0.5) or 0.0)
     found: list[DeviceEntry | None] = []
     if "camera" in document:
-        section = top.read_section("camera")
-        found.append(None if section is None else _json_entry(section, "camera", offset))
+        found.append(_json_entry(top.read_section("camera"), "camera", offset))
     elif "cameras" in document:
         cameras = top.read_section("cameras")
-        for name in () if cameras is None else tuple(cameras.record):
-            section = cameras.read_section(name) if cameras is not None else None
-            found.append(None if section is None else _json_entry(section, "camera", offset, name))
+        if cameras is not None:
+            found += [_json_entry(cameras.read_section(name), "camera", offset, name) for name in cameras.record]
     elif "fl_x" in document:
         found.append(_json_entry(top, "camera", offset))
     if "projector" in document:
-        section = top.read_section("projector")
-        found.append(None if section is None else _json_entry(section, "projector", offset))
+        found.append(_json_entry(top.read_section("projector"), "projector", offset))
     if faults.found:
         fault = faults.found[0]
         raise FileError(path, f"{fault.field}: {fault.problem}", fault.cause, fault.remedy)
@@ -298,8 +301,10 @@ def camera_names(path: Path) -> tuple[str, ...]:
     return tuple(cameras) if isinstance(cameras, dict) else ()
 
 
-def _json_entry(fields: Fields, role: Role, offset: float, name: str | None = None) -> DeviceEntry | None:
-    """One device; None if a field is missing or wrong, which is then among the faults of `fields`."""
+def _json_entry(fields: Fields | None, role: Role, offset: float, name: str | None = None) -> DeviceEntry | None:
+    """One device; None if a field is missing or wrong, which is then among the faults."""
+    if fields is None:
+        return None
     model = "OPENCV"
     for key in ("model", "camera_model"):
         if key in fields.record:

@@ -7,6 +7,7 @@ import shutil
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
@@ -133,7 +134,8 @@ class Camera:
         Raises UserError if the camera gives none for some seconds.
         """
         with self._changed:
-            here = self._changed.wait_for(lambda: self._gone or self._time > moment, _PATIENCE + self._until(moment))
+            patience = _PATIENCE + max(0.0, moment - time.monotonic())
+            here = self._changed.wait_for(lambda: self._gone or self._time > moment, patience)
             if self._gone or not here:
                 raise UserError(
                     f"{self.name} gives no more images\n    cause:  it was unplugged, or another program took it\n"
@@ -160,10 +162,6 @@ class Camera:
         self._gone = True
         self._thread.join(_PATIENCE)
         self._capture.release()
-
-    @staticmethod
-    def _until(moment: float) -> float:
-        return max(0.0, moment - time.monotonic())
 
 
 def open_camera(
@@ -286,35 +284,25 @@ class CaptureFolder:
         digest = None if pattern is None else hashlib.sha256(pattern.encode()).hexdigest()
         described = {"sl_capture": FORMAT, "pattern": digest, "w": size[0], "h": size[1]}
         content = f"{json.dumps(described, indent=1)}\n".encode()
-        self._lock = locked(root)
-        self._lock.__enter__()
-        try:
+        with ExitStack() as held:
+            held.enter_context(locked(root))
             remove_partial(root)
             if (root / DESCRIPTION).exists():
                 self._check(described)
-            else:
-                self._require_new()
+            elif all(path.name == LOCK for path in root.iterdir()):
                 write_atomic(root / DESCRIPTION, content)
+            else:
+                raise UserError(
+                    f"{root}: is not empty\n    cause:  it holds something else than captures of this command\n"
+                    "    remedy: choose another output, or remove it first"
+                )
             shutil.rmtree(root / _UNFINISHED, ignore_errors=True)
-        except BaseException as error:
-            self._lock.__exit__(type(error), error, error.__traceback__)
-            raise
-
-    def _require_new(self) -> None:
-        if any(path.name != LOCK for path in self.root.iterdir()):
-            raise UserError(
-                f"{self.root}: is not empty\n    cause:  it holds something else than captures of this command\n"
-                "    remedy: choose another output, or remove it first"
-            )
+            self._lock = held.pop_all()
 
     def _check(self, described: dict[str, object]) -> None:
         found = read_document(self.root / DESCRIPTION)
-        for key, what in (
-            ("sl_capture", "format"),
-            ("pattern", "pattern"),
-            ("w", "image width"),
-            ("h", "image height"),
-        ):
+        words = {"sl_capture": "format", "pattern": "pattern", "w": "image width", "h": "image height"}
+        for key, what in words.items():
             if found.get(key) != described[key]:
                 raise UserError(
                     f"{self.root}: was begun with another {what}\n"
@@ -325,8 +313,11 @@ class CaptureFolder:
     @property
     def frames(self) -> list[Path]:
         """Images or folders of the frames so far, by their number."""
-        found = {path: match for path in self.root.iterdir() if (match := _FRAME.fullmatch(path.name))}
-        return sorted(found, key=lambda path: int(found[path][1]))
+        return [path for _, path in self._numbered()]
+
+    def _numbered(self) -> list[tuple[int, Path]]:
+        names = ((_FRAME.fullmatch(path.name), path) for path in self.root.iterdir())
+        return sorted((int(match[1]), path) for match, path in names if match)
 
     def add(self, image: UInt8[ndarray, "h w *c"]) -> Path:
         """Write a frame of one image."""
@@ -346,8 +337,8 @@ class CaptureFolder:
         return path
 
     def _next(self) -> str:
-        numbers = [int(match[1]) for path in self.root.iterdir() if (match := _FRAME.fullmatch(path.name))]
-        return f"frame_{max(numbers, default=-1) + 1:04d}"
+        last = max((number for number, _ in self._numbered()), default=-1)
+        return f"frame_{last + 1:04d}"
 
     def __enter__(self) -> "CaptureFolder":
         """The folder itself."""
@@ -357,6 +348,6 @@ class CaptureFolder:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Let go of the folder; it is removed if it holds no frame."""
-        if not self.frames:
-            (self.root / DESCRIPTION).unlink(missing_ok=True)
-        self._lock.__exit__(kind, error, trace)
+        with self._lock:
+            if not self.frames:
+                (self.root / DESCRIPTION).unlink(missing_ok=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, Int, UInt8
+from jaxtyping import Int, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.capture.camera import Camera, CaptureFolder, Video, draw_map, draw_nodes, draw_pixels, reduced
@@ -36,9 +36,8 @@ _RADIUS = 0.4  # of the discs in the preview, periods
 _REFRESH = 0.03  # seconds between two pictures of the preview
 
 Reader = GridReader | PlainReader
-Words = Callable[
-    [GridView, SelectionVerdict, Selection], list[str]
-]  # what to say of a view; the first line matters most
+Words = Callable[[GridView, SelectionVerdict, Selection], list[str]]
+"""What to say of a view; the first line matters most."""
 
 
 def resume(folder: CaptureFolder, reader: Reader, selection: Selection) -> None:
@@ -114,39 +113,35 @@ def picture_of(image: UInt8[ndarray, "h w 3"], view: GridView) -> UInt8[ndarray,
     return draw_nodes(small, view.uv * np.float32(factor), radius)
 
 
-class WhiteLight:
-    """Photographs each frame that was kept once more, with the display white in place of the pattern.
+def with_white_light(
+    folder: Path,
+    frames: Path,
+    camera: Camera,
+    screen: Screen,
+    pattern: UInt8[ndarray, "h w"],
+    settle: float,
+    kept: Callable[[str, GridView], None],
+) -> Callable[[str, GridView], None]:
+    """A `kept` for `capture_by_hand` that also photographs each frame with the display white in place of the pattern.
 
-    For `kept` of `capture_by_hand`; the pictures have the names of the frames.
+    The pictures have the names of the frames; `frames` is the folder of the captures. Raises UserError if `folder`
+    holds pictures of other captures, and so does what it returns if a picture cannot be written.
     """
+    others = [path.name for path in sorted(folder.glob("frame_*")) if not (frames / path.name).exists()]
+    if others:
+        raise UserError(
+            f"--color {folder}: holds {others[0]}, and there is no such frame in {frames}\n"
+            "    cause:  the pictures are those of other captures\n    remedy: give a new folder"
+        )
 
-    def __init__(
-        self,
-        folder: Path,
-        frames: Path,
-        camera: Camera,
-        screen: Screen,
-        pattern: UInt8[ndarray, "h w"],
-        settle: float,
-        kept: Callable[[str, GridView], None],
-    ) -> None:
-        """`frames`: the folder of the captures. Raises UserError if `folder` holds pictures of other captures."""
-        others = [path.name for path in sorted(folder.glob("frame_*")) if not (frames / path.name).exists()]
-        if others:
-            raise UserError(
-                f"--color {folder}: holds {others[0]}, and there is no such frame in {frames}\n"
-                "    cause:  the pictures are those of other captures\n    remedy: give a new folder"
-            )
-        self._folder, self._camera, self._screen, self._kept = folder, camera, screen, kept
-        self._pattern, self._settle = pattern, settle
+    def kept_twice(name: str, view: GridView) -> None:
+        screen.show(np.full_like(pattern, 255))
+        picture = camera.after(time.monotonic() + settle)[1]
+        screen.show(pattern)
+        write_atomic(folder / name, encode_png(picture))
+        kept(name, view)
 
-    def __call__(self, name: str, view: GridView) -> None:
-        """Take the picture of the frame with this file name. Raises UserError if it cannot be written."""
-        self._screen.show(np.full_like(self._pattern, 255))
-        picture = self._camera.after(time.monotonic() + self._settle)[1]
-        self._screen.show(self._pattern)
-        write_atomic(self._folder / name, encode_png(picture))
-        self._kept(name, view)
+    return kept_twice
 
 
 _CELLS = 48  # columns of the map of the pattern
@@ -167,7 +162,8 @@ class SequenceProgress:
         self.frames += 1
         self.times_seen = self.times_seen + _cells_seen(decoded, layout, self.times_seen.shape)
         small = cv2.resize(image, (_THUMBNAIL, round(_THUMBNAIL * image.shape[0] / image.shape[1])))
-        coords = _resized(decoded.coords, (small.shape[1], small.shape[0]))
+        # at the nearest pixels: means across edges would be places that nothing shows
+        coords = cv2.resize(decoded.coords, small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
         xy = coords / np.array([layout.w, layout.h], dtype=np.float32)
         self.last = draw_pixels(small, xy, np.isfinite(xy).all(-1))
 
@@ -180,7 +176,8 @@ def start(layout: GrayCode) -> SequenceProgress:
 def resume_sequences(folder: CaptureFolder, layout: GrayCode, progress: SequenceProgress) -> None:
     """Count the frames of an earlier run. Raises UserError for one that cannot be decoded."""
     for path in track(folder.frames, "decoding the frames so far"):
-        images = [_colour(read_image(file)) for file in sorted(path.iterdir())]
+        images = [read_image(file) for file in sorted(path.iterdir())]
+        images = [image if image.ndim == 3 else np.repeat(image[..., None], 3, -1) for image in images]
         try:
             decoded = decode_gray_code(images, layout)
         except DecodingError as error:
@@ -280,12 +277,3 @@ def _cells_seen(decoded: Decoded, layout: GrayCode, shape: tuple[int, ...]) -> I
     seen = np.zeros((rows, columns), dtype=np.int64)
     seen[row, column] = 1
     return seen
-
-
-def _resized(coords: Float32[ndarray, "h w 2"], size: tuple[int, int]) -> Float32[ndarray, "_h _w 2"]:
-    """Coordinates at the nearest pixels: means across edges would be places that nothing shows."""
-    return cv2.resize(coords, size, interpolation=cv2.INTER_NEAREST)
-
-
-def _colour(image: ndarray) -> UInt8[ndarray, "h w 3"]:
-    return image if image.ndim == 3 else np.repeat(image[..., None], 3, -1)

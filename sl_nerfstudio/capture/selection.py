@@ -39,15 +39,10 @@ def measure_light(
         return Exposure(float((grey >= _SATURATED).mean()), float((brightest < _DARK).mean()))
     h, w = grey.shape
     x, y = np.clip(at.astype(np.int64), 0, (w - 1, h - 1)).T
-    inside = _windows(grey.shape, x, y, side)
-    return Exposure(float((grey[inside] >= _SATURATED).mean()), float((brightest[y, x] < _DARK).mean()))
-
-
-def _windows(shape: tuple[int, ...], x: ndarray, y: ndarray, side: int) -> Bool[ndarray, "h w"]:
-    """Pixels within half a window of one of the places."""
-    marked = np.zeros(shape, dtype=np.uint8)
+    marked = np.zeros(grey.shape, dtype=np.uint8)
     marked[y, x] = 1
-    return maximum_filter(marked, side) > 0
+    inside = maximum_filter(marked, side) > 0
+    return Exposure(float((grey[inside] >= _SATURATED).mean()), float((brightest[y, x] < _DARK).mean()))
 
 
 # What a single image shows of the coded grid, fast enough for several images a second.
@@ -145,25 +140,17 @@ class SelectionVerdict(Enum):
     BY_KEY = "by key"  # without a pattern, nothing is kept by itself
 
 
-@dataclass(frozen=True)
-class SelectionLimits:
-    """Thresholds for keeping an image."""
-
-    # Of the places that show the pattern.
-    least_nodes: int = 48  # four times what decoding needs
-    most_blur: float = 0.15  # periods; lines are 0.2 wide, and from 0.18 on captures are refused
-    most_saturated: float = 0.15  # the same limit as in decoding
-    most_dark: float = 0.3
-    # Of the whole image, where no pattern is found.
-    most_white: float = 0.5
-    most_black: float = 0.9
-    widest_edge: float = 1.8  # pixels; the same limit as in decoding
-    # Of what is new.
-    least_difference: float = 0.5  # from every kept view; that of two images from one place is below 0.02
-    pause: float = 1.0  # seconds after the last one
-
-
-DEFAULT_LIMITS = SelectionLimits()
+# What an image must have to be kept. Where the pattern is:
+_LEAST_NODES = 48  # four times what decoding needs
+MOST_BLUR = 0.15  # periods; lines are 0.2 wide, and from 0.18 on captures are refused
+_MOST_SATURATED = 0.15  # the same limit as in decoding
+_MOST_DARK = 0.3
+# In the whole image, where no pattern is found:
+_MOST_WHITE, _MOST_BLACK = 0.5, 0.9
+_WIDEST_EDGE = 1.8  # pixels; the same limit as in decoding
+# And what is new:
+_LEAST_DIFFERENCE = 0.5  # from every kept view; that of two images from one place is below 0.02
+_PAUSE = 1.0  # seconds after the last one
 
 
 @dataclass
@@ -171,34 +158,32 @@ class Selection:
     """The views that were kept, and the judgement of the next."""
 
     shape: tuple[int, int]  # rows and columns of the pattern
-    limits: SelectionLimits = DEFAULT_LIMITS
     kept: list[GridView] = field(default_factory=list)
     last: float = -np.inf  # seconds, when the last one was kept
 
     def judge(self, view: GridView, seconds: float) -> SelectionVerdict:
         """Whether to keep a view, or the first reason against it."""
-        limits = self.limits
         if view.uv.size == 0:
             return SelectionVerdict.BY_KEY
-        if view.seen.sum() < limits.least_nodes:
+        if view.seen.sum() < _LEAST_NODES:
             return self._without_pattern(view)
-        if view.light.saturated > limits.most_saturated:
+        if view.light.saturated > _MOST_SATURATED:
             return SelectionVerdict.SATURATED
-        if view.light.dark > limits.most_dark:
+        if view.light.dark > _MOST_DARK:
             return SelectionVerdict.DARK
-        if view.blur is None or view.blur > limits.most_blur:
+        if view.blur is None or view.blur > MOST_BLUR:
             return SelectionVerdict.BLURRED
-        if min((view.difference(other) for other in self.kept), default=1.0) < limits.least_difference:
+        if min((view.difference(other) for other in self.kept), default=1.0) < _LEAST_DIFFERENCE:
             return SelectionVerdict.KNOWN
-        return SelectionVerdict.KEEP if seconds - self.last >= limits.pause else SelectionVerdict.WAIT
+        return SelectionVerdict.KEEP if seconds - self.last >= _PAUSE else SelectionVerdict.WAIT
 
     def _without_pattern(self, view: GridView) -> SelectionVerdict:
         """Light and blur are named as the reason only where they hide a pattern anywhere in the image."""
-        if view.light.saturated > self.limits.most_white:
+        if view.light.saturated > _MOST_WHITE:
             return SelectionVerdict.SATURATED
-        if view.light.dark > self.limits.most_black:
+        if view.light.dark > _MOST_BLACK:
             return SelectionVerdict.DARK
-        blurred = view.edge is not None and view.edge > self.limits.widest_edge
+        blurred = view.edge is not None and view.edge > _WIDEST_EDGE
         return SelectionVerdict.BLURRED if blurred else SelectionVerdict.NO_PATTERN
 
     def add(self, view: GridView, seconds: float = -np.inf) -> None:

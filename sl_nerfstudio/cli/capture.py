@@ -246,7 +246,7 @@ def capture(config: CaptureConfig) -> None:
 
 def _single_images(config: CaptureConfig, source: "Camera | Video", layout: "GridPattern | None") -> None:
     from sl_nerfstudio.capture.camera import Camera, CaptureFolder
-    from sl_nerfstudio.capture.capture import Reader, WhiteLight, capture_by_hand, resume
+    from sl_nerfstudio.capture.capture import Reader, capture_by_hand, resume, with_white_light
     from sl_nerfstudio.capture.screen import pattern_picture
     from sl_nerfstudio.capture.selection import GridReader, GridView, PlainReader, Selection
 
@@ -262,7 +262,7 @@ def _single_images(config: CaptureConfig, source: "Camera | Video", layout: "Gri
         say(f"{_described(source)}; {'control-C ends' if config.headless else 'Space keeps an image, Escape ends'}")
         kept: Callable[[str, GridView], None] = partial(kept_words, say, selection)
         if config.color is not None and picture is not None and screen is not None and isinstance(source, Camera):
-            kept = WhiteLight(config.color, config.output, source, screen, picture, config.settle, kept)
+            kept = with_white_light(config.color, config.output, source, screen, picture, config.settle, kept)
         with _ended_by_control_c():
             capture_by_hand(source, reader, selection, folder, watcher, view_lines, kept, config.rate, config.frames)
         say(coverage_words(len(selection.kept), config.output, selection.times_seen))

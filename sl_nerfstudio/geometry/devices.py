@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, field, fields, replace
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -53,9 +53,6 @@ class Device:
     def shrunk(self, factor: int) -> "Device":
         """The device of an image whose squares of `factor` pixels are one, without what fills no square."""
         return replace(self.scaled(1 / factor), w=self.w // factor, h=self.h // factor)
-
-
-DEVICE_FIELDS = tuple(f.name for f in fields(Device))
 
 
 @dataclass(frozen=True)

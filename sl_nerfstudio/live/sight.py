@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
-from sl_nerfstudio.capture.selection import DEFAULT_LIMITS, GridView, Selection, SelectionVerdict, measure_light
+from sl_nerfstudio.capture.selection import MOST_BLUR, GridView, Selection, SelectionVerdict, measure_light
 from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.grid import FirstLook, NetworkDecoder
 from sl_nerfstudio.decoding.grid_detection import edge_width, line_blur
@@ -108,7 +108,7 @@ class Eye:
         if not 1 / PERIOD_REACH < period / PERIOD < PERIOD_REACH:
             self.factor = min(self._largest, factor * PERIOD / period)
         blur = line_blur(found.rectified, found.maps, clear_places(found.maps), self.decoder.layout)
-        sharp = blur is not None and blur < DEFAULT_LIMITS.most_blur
+        sharp = blur is not None and blur < MOST_BLUR
         first = FirstLook(grey, found, self.decoder.images.examine(grey, found))
         seen = Sight(image, first if factor == 1 else None, period=period / factor, sharp=sharp)
         step = max(1, round(max(camera.w, camera.h) / LATTICE))

@@ -388,17 +388,10 @@ _BEYOND_EDGE = (1.04, 1.1, 1.2, 1.35)  # distances from the middle at which to l
 
 @dataclass(frozen=True, eq=False)
 class PlaneFinding:
-    """A plane, facing the cameras, and what is known about it; shares are between 0 and 1."""
+    """A plane, facing the cameras, and what it is."""
 
     plane: Plane
-    share: float  # of all points that lie on it
-    cameras_in_front: float  # of the cameras
-    behind: float  # of the points in the viewed region
-    above: float  # the same, in front of it
-    continues: float  # of the directions, those in which no frame looks past its edge
-    area_ratio: float  # its bare area, in areas of what stands on it
-    height_ratio: float  # height of what stands on it, in roots of its area
-    around: float  # share of the directions in which it extends beyond what stands on it
+    share: float  # of all points, those that lie on it
     verdict: Verdict
 
     @property
@@ -423,32 +416,31 @@ def judge_plane(
     centres = np.stack([frame.T_world_camera[:3, 3] for frame in frames])
     if (plane.heights(centres) > 0).mean() < 0.5:
         plane = plane.flipped()
-    in_front = float((plane.heights(centres) > 0).mean())
+    return PlaneFinding(plane, share, _verdict(plane, pool, frames, points, region))
+
+
+def _verdict(
+    plane: Plane,
+    pool: PointPool,
+    frames: Sequence[DecodedFrame],
+    points: Sequence[FramePoints],
+    region: ViewedRegion,
+) -> Verdict:
+    centres = np.stack([frame.T_world_camera[:3, 3] for frame in frames])
     p = pool.points.p_world
     height, clear = plane.heights(p), CLEAR_SIGMAS * pool.points.sigma_along(plane.normal)
     inside = region.contains(p)
     behind, above = (float((side & inside).sum() / max(inside.sum(), 1)) for side in (height < -clear, height > clear))
-    on = pool.on(plane)
-    continues = _continues(plane, p[on], frames, points)
-    area, tall, around = _what_stands_on_it(plane, p[on], p[inside & (height > clear)], region)
-    return PlaneFinding(
-        plane, share, in_front, behind, above, continues, area, tall, around,
-        _verdict(in_front, behind, above, continues, (area, tall, around)),
-    )  # fmt: skip
-
-
-def _verdict(
-    in_front: float, behind: float, above: float, continues: float, support: tuple[float, float, float]
-) -> Verdict:
-    area, tall, around = support
-    if in_front < _CAMERAS_IN_FRONT:
+    if (plane.heights(centres) > 0).mean() < _CAMERAS_IN_FRONT:
         return "cameras on both sides"
     if behind > _MOST_BEHIND:
         return "surface behind it"
     if above < _LEAST_ABOVE:
         return "nothing on it"
-    if continues >= _CONTINUES:
+    on = p[pool.on(plane)]
+    if _continues(plane, on, frames, points) >= _CONTINUES:
         return "leaves the views"
+    area, tall, around = _what_stands_on_it(plane, on, p[inside & (height > clear)], region)
     if area >= _SUPPORT_AREA and tall >= _SUPPORT_HEIGHT and around >= _AROUND:
         return "object stands on it"
     return "edges seen"
@@ -625,9 +617,8 @@ class BarePlaces:
 
     def at(self, p_world: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
         """Whether the plane is bare below points."""
-        cell, place = np.unique(_cells(self.plane, p_world, self.size), axis=0, return_inverse=True)
-        bare = np.array([tuple(c) in self.cells for c in cell.tolist()], dtype=bool)
-        return bare[place.reshape(-1)]
+        cell, place = _cells(self.plane, p_world, self.size)
+        return np.array([tuple(c) in self.cells for c in cell.tolist()], dtype=bool)[place]
 
 
 def find_bare_places(plane: Plane, frames: Sequence[tuple[FramePoints, FramePlane]], size: float) -> BarePlaces:
@@ -652,8 +643,7 @@ def _beside_what_rises(
 
     At the edge of a plate, too, there are points below the plane; but those are surface.
     """
-    _, place = np.unique(_cells(plane, p_world, size), axis=0, return_inverse=True)
-    place = place.reshape(-1)
+    _, place = _cells(plane, p_world, size)
     count = np.bincount(place)
     rising = np.bincount(place, (z > _PLANE_SIGMAS).astype(float)) > _PRESENT * count
     flat = np.bincount(place, (np.abs(z) < _PLANE_SIGMAS).astype(float)) > _PRESENT * count
@@ -666,8 +656,7 @@ def _bare(
     """The cells in which nearly all points near the plane seem to be no higher than `height` (in sigmas)."""
     bare = max(_BARE_SIGMAS, _BARE_FACTOR * height)
     near = np.abs(z) < 2 * bare
-    cell, place = np.unique(_cells(plane, p_world[near], size), axis=0, return_inverse=True)
-    place = place.reshape(-1)
+    cell, place = _cells(plane, p_world[near], size)
     flat = (np.abs(z[near]) < height).astype(float)
     share = np.bincount(place, flat, len(cell)) / np.maximum(np.bincount(place, minlength=len(cell)), 1)
     chosen = cell[share >= _BARE_SHARE]
@@ -683,5 +672,10 @@ def on_plane(points: FramePoints, own: FramePlane, bare: BarePlaces) -> Bool[nda
     return low
 
 
-def _cells(plane: Plane, p_world: Float[ndarray, "n 3"], size: float) -> Int64[ndarray, "n 2"]:
-    return np.floor(p_world @ plane.axes().T / size).astype(np.int64)
+def _cells(
+    plane: Plane, p_world: Float[ndarray, "n 3"], size: float
+) -> tuple[Int64[ndarray, "c 2"], Int64[ndarray, "n"]]:
+    """The cells of a grid in a plane that hold points, and the number of each point's cell."""
+    cell = np.floor(p_world @ plane.axes().T / size).astype(np.int64)
+    cells, place = np.unique(cell, axis=0, return_inverse=True)
+    return cells, place.reshape(-1)

@@ -100,9 +100,9 @@ def find_object(
     centres = (voxels + 0.5) * size
     if not len(voxels):
         return ObjectVoxels(size, centres)
-    count, label = _connected(voxels)
+    label = _connected(voxels)
     distance = np.linalg.norm(centres - region.focus, axis=1) / region.radius
-    main = int(np.argmax(np.bincount(label, geman_mcclure_weight(distance**2), count)))
+    main = int(np.argmax(np.bincount(label, geman_mcclure_weight(distance**2))))
     kept = _near_main(centres, label, main, _candidates(centres, label, main, planes, size))
     return ObjectVoxels(size, centres[kept[label]])
 
@@ -119,8 +119,8 @@ def _occupied(frames: Sequence[Float[ndarray, "_n 3"]], size: float) -> Int64[nd
     return voxel[(seen_by >= _LEAST_FRAMES) | (points >= _LEAST_POINTS)]
 
 
-def _connected(voxels: Int64[ndarray, "v 3"]) -> tuple[int, Int64[ndarray, "v"]]:
-    """Number of connected parts, and the part of each voxel."""
+def _connected(voxels: Int64[ndarray, "v 3"]) -> Int64[ndarray, "v"]:
+    """The connected part of each voxel, by its number."""
     low, span = voxels.min(0) - _REACH, np.ptp(voxels, axis=0) + 2 * _REACH + 1
 
     def key(v: Int64[ndarray, "v 3"]) -> Int64[ndarray, "v"]:
@@ -138,29 +138,23 @@ def _connected(voxels: Int64[ndarray, "v 3"]) -> tuple[int, Int64[ndarray, "v"]]
         found = keys[place] == there
         pairs.append(np.stack([np.flatnonzero(found), order[place[found]]]))
     a, b = np.concatenate(pairs, 1)
-    label = component_labels(a, b, len(voxels))
-    return int(label.max(initial=-1)) + 1, label
+    return component_labels(a, b, len(voxels))
 
 
 def _candidates(
     centres: Float[ndarray, "v 3"], label: Int64[ndarray, "v"], main: int, planes: Sequence[Plane], size: float
 ) -> Bool[ndarray, "parts"]:
     """Parts that are large enough, and do not stand on a plane beside the main part."""
-    count = int(label.max(initial=-1)) + 1
-    members = np.bincount(label, minlength=count)
+    members = np.bincount(label)
     fits = members >= _LEAST_VOXELS
     for plane in planes:
-        touching = np.bincount(label, plane.heights(centres) < _TOUCHES * size, count) > 0
+        touching = np.bincount(label, plane.heights(centres) < _TOUCHES * size) > 0
         flat = (centres - centres[label == main].mean(0)) @ plane.axes().T
-        outline = Delaunay(flat[label == main]) if _has_area(flat[label == main], size) else None
-        within = np.zeros(len(flat)) if outline is None else (outline.find_simplex(flat) >= 0).astype(float)
-        fits &= ~touching | (np.bincount(label, within, count) > _WITHIN * members)
+        within, body = np.zeros(len(flat)), flat[label == main]
+        if len(body) > 3 and np.linalg.svd(body - body.mean(0), compute_uv=False)[-1] > size:  # it spans an area
+            within = (Delaunay(body).find_simplex(flat) >= 0).astype(float)
+        fits &= ~touching | (np.bincount(label, within) > _WITHIN * members)
     return fits
-
-
-def _has_area(flat: Float[ndarray, "v 2"], size: float) -> bool:
-    """Whether places span an area, so that they have an outline."""
-    return len(flat) > 3 and float(np.linalg.svd(flat - flat.mean(0), compute_uv=False)[-1]) > size
 
 
 def _near_main(
@@ -226,9 +220,8 @@ class Separation:
         if others.any():
             near = np.asarray(distance_transform_edt(~others, return_distances=False, return_indices=True))
             label[gap] = label[near[0][gap], near[1][gap]]
-            label[covered] = Part.OBJECT
-        else:
-            label[gap] = Part.OBJECT
+            gap = covered
+        label[gap] = Part.OBJECT
         return label
 
     def keeps(self, p_world: Float[ndarray, "n 3"]) -> Bool[ndarray, "n"]:
@@ -291,10 +284,9 @@ def _surroundings(
 ) -> Surroundings:
     plane = finding.plane
     own = tuple(plane_in_frame(plane, p, pose_noise, region.radius) for p in points)
-    bare = find_bare_places(plane, list(zip(points, own, strict=True)), size / 2)
-    heights = [
-        f.noise * float(np.median(p.sigma_along(plane.normal))) for f, p in zip(own, points, strict=True) if len(p)
-    ]
+    both = list(zip(points, own, strict=True))
+    bare = find_bare_places(plane, both, size / 2)
+    heights = [f.noise * float(np.median(p.sigma_along(plane.normal))) for p, f in both if len(p)]
     return Surroundings(finding, bare, own, bare.near * float(np.median(heights)))
 
 

@@ -91,6 +91,10 @@ class Captures:
             raise next(iter(self.faults.values()))
         return whole
 
+    def whole_of(self, camera: str) -> list[CapturedFrame]:
+        """The frames of a camera that have no faults."""
+        return [frame for frame in self.frames if frame.camera == camera and frame.name not in self.faults]
+
     def with_faults(self, found: dict[str, FileError]) -> "Captures":
         """Add faults; those of one frame become one."""
         both = {name: [e for e in (self.faults.get(name), found.get(name)) if e] for name in {*self.faults, *found}}
@@ -129,9 +133,8 @@ def find_captures(
 
 
 def _too_few(root: Path, sequences: bool, count: int, needed: str) -> FileError:
-    inside = [
-        path for path in sorted(root.iterdir()) if path.is_dir() and len(_frames(path, sequences)) > max(count, 1)
-    ]
+    folders = (path for path in sorted(root.iterdir()) if path.is_dir())
+    inside = [path for path in folders if len(_frames(path, sequences)) > max(count, 1)]
     if len(inside) == 1 and not _images(root):
         return FileError(
             root,
@@ -143,11 +146,10 @@ def _too_few(root: Path, sequences: bool, count: int, needed: str) -> FileError:
     if raw:
         return raw_file(raw[0])
     what = "folders with images" if sequences else "images"
-    other = _single_images(root) if sequences else _folders(root)
     cause, remedy = "a typing error in --images, or images of another format", ""
     if count:
         cause = f"too few were captured, or {cause}"
-    if len(other) > 1:
+    if len(_frames(root, not sequences)) > 1:
         cause = "the captures do not suit the pattern: a coded grid needs one image per frame, Gray code one sub-folder"
         remedy = "" if sequences else '; for several cameras, name them under "cameras" in the intrinsics file'
     wanted = "sub-folders, one for each frame" if sequences else f"{', '.join(ENDINGS)} files"
@@ -170,10 +172,6 @@ def _of_cameras(root: Path, sequences: bool, cameras: Sequence[str]) -> list[lis
     ]
 
 
-def _frames(root: Path, sequences: bool) -> list[CapturedFrame]:
-    return _folders(root) if sequences else _single_images(root)
-
-
 def _checked(frames: Sequence[CapturedFrame]) -> Captures:
     sizes: dict[Path, Size] = {}
     faults: dict[str, list[FileError]] = {}
@@ -186,10 +184,10 @@ def _checked(frames: Sequence[CapturedFrame]) -> Captures:
                 faults.setdefault(frame.name, []).append(error)
     usual: dict[str, Size] = {}
     for camera in dict.fromkeys(frame.camera for frame in frames):
-        own = [path for frame in frames if frame.camera == camera for path in frame.images]
-        known = [sizes[path] for path in own if path in sizes]
+        own = [frame for frame in frames if frame.camera == camera]
+        known = [sizes[path] for frame in own for path in frame.images if path in sizes]
         if not known:
-            raise _of_a_kind([e for frame in frames if frame.camera == camera for e in faults[frame.name]])[0]
+            raise _of_a_kind([error for frame in own for error in faults[frame.name]])[0]
         usual[camera] = Counter(known).most_common(1)[0][0]
     for frame in frames:
         for path in frame.images:
@@ -212,9 +210,16 @@ def _of_a_kind(errors: Sequence[FileError]) -> list[FileError]:
     out = []
     for first, *others in same.values():
         names = [error.path.name for error in others]
-        more = f" (and so {'are' if len(names) > 1 else 'is'} {listed(names, _LISTED)})" if names else ""
-        out.append(first if not more else FileError(first.path, first.problem + more, first.cause, first.remedy))
+        more = f" (and so {'are' if len(names) > 1 else 'is'} {listed(names, _LISTED)})"
+        out.append(first.with_more(more) if names else first)
     return out
+
+
+def with_others(faults: Sequence[FileError], most: int = 20) -> FileError:
+    """The first fault, with the names of at most so many of the other files that cannot be used."""
+    first, *others = faults
+    names = listed([fault.path.name for fault in others], most)
+    return first.with_more(f" (and {len(others)} more cannot be used: {names})") if others else first
 
 
 def _together(frame: CapturedFrame, errors: Sequence[FileError]) -> FileError:
@@ -237,11 +242,10 @@ def _other_size(path: Path, size: Size, usual: Size) -> FileError:
     )
 
 
-def _single_images(root: Path) -> list[CapturedFrame]:
-    return [CapturedFrame(path.stem, (path,)) for path in _images(root)]
-
-
-def _folders(root: Path) -> list[CapturedFrame]:
+def _frames(root: Path, sequences: bool) -> list[CapturedFrame]:
+    """The images in a folder, or the folders in it that hold images."""
+    if not sequences:
+        return [CapturedFrame(path.stem, (path,)) for path in _images(root)]
     folders = sorted((p for p in root.iterdir() if p.is_dir() and not p.name.startswith(".")), key=_natural)
     return [CapturedFrame(folder.name, images) for folder in folders if (images := tuple(_images(folder)))]
 
@@ -332,8 +336,7 @@ def _require_resolution(captures: Captures, layout: GrayCode) -> None:
     Cells beyond the stated ones cannot be. Cells that are missing tell where the edge of the pattern is seen: all rows
     end at the same column.
     """
-    bits_only = [axis for axis in (0, 1) if layout.bit_images(axis) and not layout.sines(axis)]
-    if len(bits_only) < 2:
+    if any(layout.sines(axis) or not layout.bit_images(axis) for axis in (0, 1)):
         return
     whole = captures.require_whole()
     w, h = captures.size
@@ -350,22 +353,19 @@ def _require_resolution(captures: Captures, layout: GrayCode) -> None:
             continue
         reach = np.where(np.isfinite(edge), edge, np.ceil(_reach(cells))).astype(int)
         likely = _likely_resolutions(layout, reach, edge)
+        given, cells = f"{layout.w} x {layout.h} pixels", f"{stated[0]} x {stated[1]} cells"
         if beyond.any():
-            cannot = (
-                f"which {layout.w} x {layout.h} pixels cannot have ({stated[0]} x {stated[1]} cells of {layout.cell})"
-            )
+            cannot = f"which {given} cannot have ({cells} of {layout.cell})"
         elif likely:
-            cannot = f"where it ends, and {layout.w} x {layout.h} pixels have {stated[0]} x {stated[1]} cells"
+            cannot = f"where it ends, and {given} have {cells}"
         else:
             continue  # something else than the edge of the pattern may have a straight border
-        cause = (
-            "--pattern gives another resolution than that of the projector, or of the window that showed the pattern"
-        )
         size = f"--pattern {likely[0].split()[0]}" if likely else "the resolution of the projector"
         raise FileError(
             frame.images[0].parent,
             f"shows {reach[0]} columns and {reach[1]} rows of cells, {cannot}",
-            cause + (f"; likely: {' or '.join(likely)}" if likely else ""),
+            "--pattern gives another resolution than that of the projector, or of the window that showed the pattern"
+            + (f"; likely: {' or '.join(likely)}" if likely else ""),
             f"give {size}, or the pattern.json of what was projected",
         )
 
@@ -391,14 +391,10 @@ def _likely_resolutions(layout: GrayCode, reach: Int64[ndarray, "2"], edge: Floa
         for cell in range(1, min(_LARGEST_CELL, h // 2) + 1):
             other = GrayCode(w, h, cell)
             beyond = np.array([other.columns, other.rows]) - reach
-            far = np.where(np.isfinite(edge), np.abs(beyond) / reach, 0.0)
-            if (
-                other.bits == layout.bits
-                and (beyond >= -1).all()
-                and far.max() < _NEAR
-                and (w, h) != (layout.w, layout.h)
-            ):
-                found.append((round(far.max(), 2), cell, f"{w}x{h} (cells of {cell})"))
+            far = np.where(np.isfinite(edge), np.abs(beyond) / reach, 0.0).max()
+            another = other.bits == layout.bits and (w, h) != (layout.w, layout.h)
+            if another and (beyond >= -1).all() and far < _NEAR:
+                found.append((round(far, 2), cell, f"{w}x{h} (cells of {cell})"))
     return [text for *_, text in sorted(found)[:_MOST_LIKELY]]
 
 
@@ -454,7 +450,7 @@ def _missing_numbers(stems: Sequence[str]) -> list[str]:
     numbers = [int(match[1]) for match in found if match is not None]
     if len(numbers) != len(stems) or numbers != sorted(set(numbers)):
         return []
-    gaps = [n for n in range(numbers[0], numbers[-1]) if n not in set(numbers)] if len(numbers) > 1 else []
+    gaps = sorted({*range(numbers[0], numbers[-1])} - {*numbers})
     return [str(n) for n in gaps] if len(gaps) <= len(numbers) // 4 + 1 else []
 
 

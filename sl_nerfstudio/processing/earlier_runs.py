@@ -1,17 +1,16 @@
 """Earlier runs with the same captures: the work folder that they filled, and the scans that may be renewed."""
 
 import hashlib
-import json
 import os
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.cache import FOLDER
 from sl_nerfstudio.processing.captures import Captures
 from sl_nerfstudio.processing.config import ProcessConfig
+from sl_nerfstudio.processing.records import read_note
 from sl_nerfstudio.scan.write import encode_json
 from sl_nerfstudio.storage import LOCK, NewFolder, files_below, held_by_another, write_atomic
 
@@ -47,17 +46,7 @@ def _notes() -> Path:
 
 
 def _noted_work() -> dict[str, str]:
-    found = _document(_notes())
-    return {key: work for key, work in found.items() if isinstance(work, str)}
-
-
-def _document(path: Path) -> dict[str, Any]:
-    """A JSON object; empty if there is none that can be read."""
-    try:
-        found = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}
+    return {key: work for key, work in read_note(_notes()).items() if isinstance(work, str)}
 
 
 # Scans that were made in a work folder. As long as one is as it was written, the same captures may renew it: everything
@@ -106,18 +95,14 @@ def written_scan(config: ProcessConfig) -> WrittenScan | None:
     Raises UserError if any file in it has been added, changed or removed since.
     """
     root = config.output
-    record = _document(config.work_folder / _SCANS).get(_place(config))
+    record = read_note(config.work_folder / _SCANS).get(_place(config))
     if not isinstance(record, dict) or record.keys() != {"captures", "files"} or not root.is_dir():
         return None
     written, there = WrittenScan(**record), files_below(root)
     if not there:
         return None
     changed = set(there) ^ set(written.files)
-    changed |= {
-        name
-        for name in set(there) - changed
-        if hashlib.sha256((root / name).read_bytes()).hexdigest() != written.files[name]
-    }
+    changed |= {name for name in set(there) - changed if _digest(root / name) != written.files[name]}
     if changed and os.path.lexists(root / LOCK):
         return None  # a run was killed while it renewed the scan: its list says what it leaves
     if changed:
@@ -133,7 +118,7 @@ def written_scan(config: ProcessConfig) -> WrittenScan | None:
 def note_scan(config: ProcessConfig, folder: NewFolder, captures: str) -> None:
     """Note what was written to the output, so that the next run of the same captures may renew it."""
     path = config.work_folder / _SCANS
-    scans = {place: scan for place, scan in _document(path).items() if os.path.isdir(config.work_folder / place)}
+    scans = {place: scan for place, scan in read_note(path).items() if os.path.isdir(config.work_folder / place)}
     scans[_place(config)] = asdict(WrittenScan(captures, folder.digests))
     write_atomic(path, encode_json(scans))
 

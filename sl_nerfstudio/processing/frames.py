@@ -43,6 +43,7 @@ from sl_nerfstudio.relative_pose.estimation import (
     estimate_relative_pose,
     relative_pose_near,
 )
+from sl_nerfstudio.relative_pose.joint_fit import FrameMatches
 from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.images import Pixels, as_grey
@@ -112,6 +113,13 @@ def clouds_of(results: Sequence[FrameStageResult]) -> list[FrameCloud]:
     return [result.cloud for result in results if result.cloud is not None]
 
 
+def matches_of(clouds: Sequence[FrameCloud]) -> tuple[list[FrameMatches], list[tuple[ndarray, ndarray]]]:
+    """The correspondences of frames, and R and t of their relative poses: what fits to all frames start from."""
+    frames = [FrameMatches(cloud.name, *correspondences_of(cloud.coords), cloud.camera) for cloud in clouds]
+    T = [cloud.pose.T_camera_projector for cloud in clouds]
+    return frames, [(one[:3, :3], one[:3, 3]) for one in T]
+
+
 def with_clouds(results: Sequence[FrameStageResult], clouds: Sequence[FrameCloud]) -> list[FrameStageResult]:
     """The results with other clouds of the same frames, in the order of `clouds_of`."""
     found = iter(clouds)
@@ -167,14 +175,14 @@ class FrameWorker:
 
     def load_mask(self, result: FrameStageResult) -> Bool[ndarray, "h w"]:
         """The mask of a frame like that of `load`, without its other maps."""
-        mask = self._store.load_mask(result.frame, result.matched or result.key)
+        mask = self._store.load_one(result.frame, result.matched or result.key, "mask")
         if mask is None:
             raise self._missing(result)
         return mask if self._job.masks is None else mask & self._job.masks.of(result.name)
 
     def image(self, result: FrameStageResult, place: int) -> Pixels:
         """One of the photographs at the size that is decoded. Raises FileError."""
-        stored = self._store.load_image(result.frame, result.key) if result.key and place == 0 else None
+        stored = self._store.load_one(result.frame, result.key, "image") if result.key and place == 0 else None
         return result.frame.read(place) if stored is None else stored
 
     def load_with_seen(self, result: FrameStageResult) -> tuple[Decoded, Bool[ndarray, "h w"]]:
@@ -209,23 +217,14 @@ class FrameWorker:
 
         With `near`, the pose that the coordinates were matched with, no other one is looked for.
         """
-        coords, job = decoded.coords, self._job
-        devices = job.camera_of(result.frame), job.projector
-        if near is None:
-            inputs = (coords, *devices, job.seed)
-            return self._stages.kept(
-                "calibration",
-                inputs,
-                lambda: estimate_relative_pose(*correspondences_of(coords), *devices, job.seed),
-                result.name,
-            )
-        T = near.T_camera_projector
-        return self._stages.kept(
-            "calibration",
-            (coords, *devices, job.seed, T),
-            lambda: relative_pose_near(T, *correspondences_of(coords), *devices, job.seed),
-            result.name,
-        )
+        coords, given = decoded.coords, (self._job.camera_of(result.frame), self._job.projector, self._job.seed)
+        start = () if near is None else (near.T_camera_projector,)
+
+        def compute() -> RelativePose:
+            seen = correspondences_of(coords)
+            return relative_pose_near(*start, *seen, *given) if start else estimate_relative_pose(*seen, *given)
+
+        return self._stages.kept("calibration", (coords, *given, *start), compute, result.name)
 
     def _match(self, result: FrameStageResult, decoded: Decoded, pose: RelativePose) -> tuple[str, Decoded] | None:
         """Key and maps of a frame matched along the epipolar lines of `pose`; None where it is left as it is.

@@ -42,15 +42,20 @@ from sl_nerfstudio.processing.captures import (
     resolution,
 )
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
-from sl_nerfstudio.processing.frames import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_kept_cloud
+from sl_nerfstudio.processing.frames import (
+    FrameJob,
+    FrameStageResult,
+    FrameWorker,
+    clouds_of,
+    matches_of,
+    with_kept_cloud,
+)
 from sl_nerfstudio.processing.masks import find_masks
 from sl_nerfstudio.processing.pictures import find_pictures, picture_sentences
 from sl_nerfstudio.processing.records import DecodedStore, LargeClouds
 from sl_nerfstudio.processing.video import VideoChoice, is_video, video_frames
 from sl_nerfstudio.registration.result import KnownLength, is_index, parse_known_length
-from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from sl_nerfstudio.relative_pose.intrinsics import CameraEstimate, estimate_camera
-from sl_nerfstudio.relative_pose.joint_fit import FrameMatches
 from sl_nerfstudio.scan.document import Faults, Fields, FileError, document_faults, frame_label, read_document
 from sl_nerfstudio.scan.images import read_photograph, refuse_mosaic
 from sl_nerfstudio.scan.read import POSES, read_pose
@@ -94,10 +99,7 @@ def read_cameras(config: ProcessConfig, captures: Captures) -> Cameras:
         }
         first = next(iter(captures.sizes))
         return Cameras(found, sigma=read_stated_sigma(path, "camera", captures.sizes[first], step, first))
-    images = [frame.images[0] for frame in captures.frames if frame.name not in captures.faults]
-    if not images:
-        raise next(iter(captures.faults.values()))
-    start = camera_from_exif(images, captures.size)
+    start = camera_from_exif([frame.images[0] for frame in captures.require_whole()], captures.size)
     return Cameras({"": start.camera}, start)
 
 
@@ -155,9 +157,7 @@ def refine_camera(
     """
     refined, again, found = job, list(results), None
     for _ in range(_ROUNDS):
-        own = clouds_of(again)
-        frames = [FrameMatches(cloud.name, *correspondences_of(cloud.coords), refined.camera) for cloud in own]
-        poses = [(cloud.pose.T_camera_projector[:3, :3], cloud.pose.T_camera_projector[:3, 3]) for cloud in own]
+        frames, poses = matches_of(clouds_of(again))
         if not frames:
             break
         found = estimate_camera(frames, poses, job.camera, job.projector, start.sigma, job.seed)
@@ -184,7 +184,6 @@ def read_projector(config: ProcessConfig, size: tuple[int, int]) -> tuple[Device
 
     If it is to be found from the frames, no file needs to: then only its size is known. Raises UserError.
     """
-    path = _file(config)
     if config.finds_projector and not _described(config):
         if config.projector_model == "DOE":
             raise UserError(
@@ -194,12 +193,7 @@ def read_projector(config: ProcessConfig, size: tuple[int, int]) -> tuple[Device
             )
         w, h = size
         return Device(w, h, _USUAL_FOCAL * w, _USUAL_FOCAL * w, w / 2, h / 2), False
-    return read_device_file(path, "projector", size, config.projector_model, config.procam_step), True
-
-
-def read_projector_sigma(config: ProcessConfig, size: tuple[int, int]) -> Shares:
-    """How uncertain the file says that the projector is."""
-    return read_stated_sigma(_file(config), "projector", size, config.procam_step)
+    return read_device_file(_file(config), "projector", size, config.projector_model, config.procam_step), True
 
 
 def _file(config: ProcessConfig) -> Path:
@@ -246,10 +240,6 @@ class CaptureNotes:
     shrink: int = 1  # squares of so many pixels of the photographs are read as one
     camera: dict[str, Any] | None = None  # figures of a camera that no file describes
 
-    def with_camera(self, sentence: str, figures: dict[str, Any]) -> "CaptureNotes":
-        """Add what is known of a camera that no file describes."""
-        return replace(self, sentences=(*self.sentences, sentence), camera=figures)
-
     def document(self) -> dict[str, Any]:
         """Return the figures as JSON."""
         video = None if self.video is None else self.video.document()
@@ -289,9 +279,11 @@ def read_captured(config: ProcessConfig) -> CapturedFrames:
             "a video shows the frames of one camera",
             "give a file with this camera alone",
         )
-    decoder = (
-        None if layout is None else choose_decoder(layout, config.decoder, config.pattern, config.sequence is not None)
-    )
+
+    def chosen_for(layout: PatternLayout) -> Decoder[Any]:
+        return choose_decoder(layout, config.decoder, config.pattern, config.sequence is not None)
+
+    decoder = None if layout is None else chosen_for(layout)
     captures = find_captures(root, decoder is None or decoder.sequence, cameras)
     if not config.not_mosaic and video is None:
         _refuse_mosaics(captures)
@@ -299,7 +291,7 @@ def read_captured(config: ProcessConfig) -> CapturedFrames:
         layout = recognise_sequence(captures, size, config.sequence, config.cell)
     if layout is None:
         raise ValueError("a pattern is a file or a resolution")
-    decoder = decoder or choose_decoder(layout, config.decoder, config.pattern, config.sequence is not None)
+    decoder = decoder or chosen_for(layout)
     sentences: list[str] = [] if video is None else list(video.sentences())
     if isinstance(decoder, NetworkDecoder):
         device, sentence = usable_device(config.device)
@@ -326,9 +318,8 @@ def _layout(config: ProcessConfig) -> PatternLayout:
 def _refuse_mosaics(captures: Captures) -> None:
     """Look at three images of the first whole frame of every camera. Raises FileError for raw mosaics."""
     for camera in captures.sizes:
-        whole = [f for f in captures.frames if f.camera == camera and f.name not in captures.faults]
-        if whole:
-            images = whole[0].images
+        for frame in captures.whole_of(camera)[:1]:
+            images = frame.images
             for path in dict.fromkeys((images[0], images[len(images) // 2], images[-1])):
                 refuse_mosaic(path)
 
@@ -347,7 +338,7 @@ def shrink_factor(captures: Captures, decoder: Decoder[Any], work: Path) -> int:
         return 1
     looked_at: list[CapturedFrame] = []
     for camera in captures.sizes:
-        frames = [f for f in captures.frames if f.camera == camera and f.name not in captures.faults]
+        frames = captures.whole_of(camera)
         places = np.unique(np.linspace(0, len(frames) - 1, min(_SEEN, len(frames))).astype(int))
         looked_at += [frames[place] for place in places]
     store = DecodedStore(work, decoder.key)
@@ -496,7 +487,9 @@ def read_inputs(config: ProcessConfig) -> Inputs:
     masks = None if config.masks is None else find_masks(config.masks, sizes)
     pictures = {} if config.color is None else find_pictures(config.color, captures)
     said = picture_sentences(pictures, captures) if pictures else ()
-    doubt = StatedSigma(cameras.sigma, read_projector_sigma(config, (layout.w, layout.h)) if stated else CERTAIN)
+    file = _file(config) if stated else None
+    sigma = read_stated_sigma(file, "projector", (layout.w, layout.h), config.procam_step)
+    doubt = StatedSigma(cameras.sigma, sigma)
     last_step = "decode" if config.finds_projector else "match" if cameras.start is None else "calibrate"
     given = None if config.poses is None else read_given_poses(config.poses, names)
     known = None if known is None else frames_by_name(known, names)

@@ -15,6 +15,7 @@ from PIL import Image, UnidentifiedImageError
 from sl_nerfstudio.console import track
 from sl_nerfstudio.decoding.decoder import Decoded, DecodingError
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.processing.captures import with_others
 from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError, read_bytes, unreadable
 from sl_nerfstudio.scan.images import FORMATS, read_image, shrunk
@@ -158,18 +159,14 @@ def find_masks(folder: Path, frames: dict[str, tuple[int, int]], shrink: int = 1
     missing = [name for name in frames if name not in files]
     if missing:
         raise FileError(
-            folder, f"has no mask for {_count(len(missing), len(frames))}: {listed(missing, _LISTED)}",
+            folder, f"has no mask for {len(missing)} of {len(frames)} frames: {listed(missing, _LISTED)}",
             "masks are found by the name of the frame, without its ending",
             "add these masks (all white to use a whole capture), or take the captures out",
         )  # fmt: skip
     twice = [name for name, number in Counter(p.stem for p in found).items() if number > 1 and name in frames]
     if twice:
-        raise FileError(
-            folder,
-            f"holds several masks for {listed(twice, _LISTED)}",
-            "the same mask in two formats",
-            "keep one of them",
-        )
+        problem = f"holds several masks for {listed(twice, _LISTED)}"
+        raise FileError(folder, problem, "the same mask in two formats", "keep one of them")
     used = {name: files[name] for name in frames}
     return UserMasks(folder, frames, used, _checked(used, frames), shrink)
 
@@ -182,15 +179,9 @@ def _checked(files: dict[str, Path], sizes: dict[str, tuple[int, int]]) -> dict[
         except FileError as error:
             faults.append(error)
     if faults:
-        first, others = faults[0], [fault.path.name for fault in faults[1:]]
-        more = f" (and {len(others)} more cannot be used: {listed(others, _LISTED)})" if others else ""
-        raise FileError(first.path, first.problem + more, first.cause, first.remedy)
+        raise with_others(faults)
     return digests
 
 
 def _digest(mask: Bool[ndarray, "h w"]) -> str:
     return hashlib.sha256(np.packbits(mask).tobytes()).hexdigest()[:24]
-
-
-def _count(some: int, total: int) -> str:
-    return f"{some} of {total} frames"

@@ -79,17 +79,10 @@ def find_object_only(
                 worker.load_mask(by_name[cloud.name]),
             ))  # fmt: skip
     found = separate(frames, job.seed)
-    parts = {
-        name: found.parts(k, frame)
-        for k, (name, frame) in enumerate(zip(names, track(frames, "object only"), strict=True))
-    }
+    tracked = enumerate(zip(names, track(frames, "object only"), strict=True))
+    parts = {name: found.parts(k, frame) for k, (name, frame) in tracked}
     shares = tuple(_shares(name, parts[name], frame.coords) for name, frame in zip(names, frames, strict=True))
     return ObjectOnly(found.findings, tuple(s.finding for s in found.surroundings), shares, parts)
-
-
-def with_usable_scale(poses: ScanPoses, found: ObjectOnly) -> ScanPoses:
-    """The poses with a scale that does not refer to what was left out."""
-    return replace(poses, scale=found.usable_scale(poses.scale))
 
 
 def only_object(
@@ -125,10 +118,8 @@ _BECAUSE: dict[Verdict, str] = {
 
 def object_sentences(found: ObjectOnly) -> tuple[str, ...]:
     """What was left out and what was kept, the most important first."""
-    shares = found.shares()
-    if not found.left_out:
-        begin = "no plane was left out"
-    else:
+    shares, begin = found.shares(), "no plane was left out"
+    if found.left_out:
         begin = f"left out {shares.plane:.0%} of the decoded pixels as planes around the object"
     lines = [f"{begin}, and {shares.beyond:.1%} as not connected to it; {shares.object:.0%} show the object"]
     if found.planes and not found.left_out and any(plane.is_surroundings for plane in found.planes):
@@ -196,31 +187,25 @@ def make_preview(
     `part` is what each pixel shows (`Part`), if surroundings were looked for.
     `size` is the pattern's (w, h): x gives red, y gives blue; grey where nothing was decoded.
     """
-    picture = colours = None
+    picture = colours = tinted = None
     side = max(_SMALLEST, round(_SIDE * min(1.0, _PICTURES / (2 * frames)) ** 0.5))
     if image is not None:
-        step = _step(image.shape, side)
-        grey = as_grey(image[::step, ::step])
+        grey = as_grey(_thinned(image, side))
         picture = np.repeat((grey / max(float(grey.max()), 1e-6))[..., None], 3, -1)
     if coords is not None:
-        step = _step(coords.shape, side)
-        thin = coords[::step, ::step]
+        thin = _thinned(coords, side)
         place = np.nan_to_num(thin) / np.array(size, dtype=np.float32)
         colours = np.stack([place[..., 0], np.full(thin.shape[:2], 0.35), place[..., 1]], -1).astype(np.float32)
         colours[np.isnan(thin).any(-1)] = 0.85
-    if picture is None or part is None:
-        return Preview(picture, colours)
-    step = _step(part.shape, side)
-    return Preview(picture, colours, _tinted(picture, part[::step, ::step]))
+    if picture is not None and part is not None:
+        tinted, thin = picture.copy(), _thinned(part, side)
+        for kind, colour in _TINTS.items():
+            shown = thin == kind
+            tinted[shown] = (1 - _TINT) * tinted[shown] + _TINT * np.array(colour, dtype=np.float32)
+    return Preview(picture, colours, tinted)
 
 
-def _tinted(picture: Float32[ndarray, "h w 3"], part: UInt8[ndarray, "h w"]) -> Float32[ndarray, "h w 3"]:
-    """The picture with what was left out in colour."""
-    out = picture.copy()
-    for kind, colour in _TINTS.items():
-        out[part == kind] = (1 - _TINT) * out[part == kind] + _TINT * np.array(colour, dtype=np.float32)
-    return out
-
-
-def _step(shape: tuple[int, ...], side: int) -> int:
-    return max(1, -(-max(shape[:2]) // side))
+def _thinned(pixels: ndarray, side: int) -> ndarray:
+    """Every n-th row and column, so that no side is longer than `side`."""
+    step = max(1, -(-max(pixels.shape[:2]) // side))
+    return pixels[::step, ::step]

@@ -4,12 +4,10 @@ import os
 from collections import Counter
 from pathlib import Path
 
-from sl_nerfstudio.processing.captures import CapturedFrame, Captures
+from sl_nerfstudio.processing.captures import CapturedFrame, Captures, with_others
 from sl_nerfstudio.review.verdict import listed
 from sl_nerfstudio.scan.document import FileError, unreadable
 from sl_nerfstudio.scan.images import ENDINGS, RAW, photograph_header, raw_file
-
-_LISTED = 20  # frames in a message
 
 
 def find_pictures(folder: Path, captures: Captures) -> dict[str, Path]:
@@ -40,9 +38,7 @@ def find_pictures(folder: Path, captures: Captures) -> dict[str, Path]:
         )  # fmt: skip
     faults = [fault for name, paths in used.items() if (fault := _fault(frames[name], paths, captures)) is not None]
     if faults:
-        others = [fault.path.name for fault in faults[1:]]
-        more = f" (and {len(others)} more cannot be used: {listed(others, _LISTED)})" if others else ""
-        raise FileError(faults[0].path, faults[0].problem + more, faults[0].cause, faults[0].remedy)
+        raise with_others(faults)
     return {name: paths[0] for name, paths in used.items()}
 
 
@@ -74,7 +70,7 @@ def _fault(frame: CapturedFrame, paths: list[Path], captures: Captures) -> FileE
 def picture_sentences(pictures: dict[str, Path], captures: Captures) -> tuple[str, ...]:
     """How many frames have a picture, and which have none."""
     without = [frame.name for frame in captures.frames if frame.name not in pictures]
-    missing = f"; none of {listed(without, _LISTED)}" if without else ""
+    missing = f"; none of {listed(without, 20)}" if without else ""
     sizes = Counter(path.suffix.lower().lstrip(".") for path in pictures.values())
     kinds = ", ".join(f"{count} {kind}" for kind, count in sizes.items())
     return (f"colours from {len(pictures)} photographs without the pattern ({kinds}){missing}",)

@@ -6,7 +6,7 @@ Decoded frames, the registration and the adjustment are kept in the work folder,
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -53,7 +53,6 @@ from sl_nerfstudio.processing.object_only import (
     make_preview,
     object_sentences,
     only_object,
-    with_usable_scale,
 )
 from sl_nerfstudio.processing.projector import (
     CalibratedFrames,
@@ -79,15 +78,18 @@ from sl_nerfstudio.scan.images import Pixels, read_photograph
 from sl_nerfstudio.scan.write import ScanWriter, encode_json
 from sl_nerfstudio.storage import NewFolder, write_atomic
 
+MakeReport = Callable[[ProcessResult, Sequence[Preview]], str]
+Log = Callable[[str], None]
+Watch = Callable[[Sequence[FrameCloud], DevicePoses, str], None]
+"""Gets the frames, their poses (NaN where a frame was left out), and the word for what was done with them."""
+
 # The errors of a run whose frames cannot make a scan: they say what happened to every frame.
 
 REPORT = "processing.html"
 _LISTED = 20  # frames in a message
 
 
-def too_few_frames(
-    result: ProcessResult, usable: int, make_report: Callable[[ProcessResult, Sequence[Preview]], str]
-) -> UserError:
+def too_few_frames(result: ProcessResult, usable: int, make_report: MakeReport) -> UserError:
     """The error of a run in which fewer than two frames are usable; its report goes to the work folder."""
     config = result.config
     path = config.work_folder / REPORT
@@ -152,7 +154,7 @@ def write_scan(
     poses: ScanPoses,
     result: ProcessResult,
     pictures: dict[str, Path],
-    make_report: Callable[[ProcessResult, Sequence[Preview]], str],
+    make_report: MakeReport,
 ) -> None:
     """Write all frames that are in the scan by `result`. Leaving the folder completes it.
 
@@ -213,12 +215,6 @@ def _image(worker: FrameWorker, frame: FrameStageResult, shown: int) -> Pixels |
         return None
 
 
-MakeReport = Callable[[ProcessResult, Sequence[Preview]], str]
-Log = Callable[[str], None]
-Watch = Callable[[Sequence[FrameCloud], DevicePoses, str], None]
-"""Gets the frames, their poses (NaN where a frame was left out), and the word for what was done with them."""
-
-
 def process(config: ProcessConfig, make_report: MakeReport, log: Log, watch: Watch | None = None) -> ProcessResult:
     """Make the scan folder; `log` gets a line of text for every stage, `watch` the poses as soon as they are known.
 
@@ -256,167 +252,184 @@ def _process(
         if earlier is not None:
             earlier.require_same(digest, config.output)
             log(f"{config.output} holds an earlier scan of the same captures, which this one replaces")
+    run = _Run(config, inputs, make_report, log)
     with phase("decode"):
-        frames = _calibrate(config, inputs, make_report, log)
-        wrong = _wrong_intrinsics(inputs, frames, log)
+        frames = run.calibrated()
+        wrong = run.wrong_intrinsics(frames)
     with phase("register"):
-        given = _given(inputs, frames.results)
-        frames, registration = _register(config, inputs, frames, given, log)
-        _require_registered(config, inputs, frames.results, registration, wrong, make_report)
+        frames, registration = run.registered(frames)
+        run.require_registered(frames.results, registration, wrong)
         if watch is not None:
             clouds = clouds_of(frames.results)
             watch(clouds, keep_registered(clouds, registration).poses, "registered")
     with phase("adjust"):
-        frames, consistent = _adjust(config, inputs, frames, registration, log)
-        frames, consistent, moving = _register_what_moves(config, inputs, frames, consistent, log)
+        frames, consistent = run.adjusted(frames, registration)
+        frames, consistent, moving = run.registered_by_what_moves(frames, consistent)
         both = consistent.adjusted.median_before_px, consistent.adjusted.median_after_px
         if np.isfinite(both).all():
             log("frames agree to {1:.2f} px, {0:.2f} px before".format(*both))
         if watch is not None:
             watch(clouds_of(frames.results), consistent.adjusted.poses, "adjusted together")
     with phase("write"):
-        result = _write(config, inputs, frames, consistent, moving, wrong, folder, make_report, log)
+        result = run.written(folder, frames, consistent, moving, wrong)
         note_scan(config, folder, digest)
     return result
 
 
-def _write(
-    config: ProcessConfig,
-    inputs: Inputs,
-    frames: CalibratedFrames,
-    consistent: ConsistentFrames,
-    moving: MovingPart | None,
-    wrong: str,
-    folder: NewFolder,
-    make_report: MakeReport,
-    log: Log,
-) -> ProcessResult:
-    """Judge the adjusted frames, and write the scan with its report."""
-    given = _given(inputs, frames.results)
-    registration, adjusted = consistent.registration, within_stated_doubt(consistent.adjusted, frames.job.stated)
-    poses = find_scan_poses(clouds_of(frames.results), registration, adjusted, inputs.known, given)
-    parts, cross, shown, results = None, consistent.cross, registration, frames.results
-    if config.object_only:
-        parts = find_object_only(frames.job, frames.results, registration, poses)
-        log("object only: " + "\n    ".join(object_sentences(parts)))
-        poses = with_usable_scale(poses, parts)
-        shown, results = only_object(registration, frames.results, parts)
-        enough = shown.registered.sum() >= FEWEST_FRAMES
-        cross = compare_registered(clouds_of(results), shown, adjusted, not config.no_adjust) if enough else None
-    shares = () if cross is None else _surface_shares(frames.job, results, shown, adjusted.poses, parts)
-    result = summarise(
-        config,
-        inputs.job.decoder.name,
-        frames.results,
-        registration,
-        poses,
-        cross,
-        shares,
-        frames.found,
-        wrong,
-        frames.notes,
-        parts,
-        moving,
-    )
-    write_scan(folder, frames.job, frames.results, poses, result, inputs.pictures, make_report)
-    return result
+@dataclass(frozen=True)
+class _Run:
+    """The stages after the inputs were read."""
 
+    config: ProcessConfig
+    inputs: Inputs
+    make_report: MakeReport
+    log: Log
 
-def _given(inputs: Inputs, results: Sequence[FrameStageResult]) -> GivenPoses | None:
-    """The given poses of the frames that have clouds."""
-    return inputs.given and inputs.given.chosen([result.cloud is not None for result in results])
+    def given(self, results: Sequence[FrameStageResult]) -> GivenPoses | None:
+        """The given poses of the frames that have clouds."""
+        return self.inputs.given and self.inputs.given.chosen([result.cloud is not None for result in results])
 
+    def calibrated(self) -> CalibratedFrames:
+        """All frames decoded and calibrated; a camera that no file describes is refined with all of them.
 
-def _calibrate(config: ProcessConfig, inputs: Inputs, make_report: MakeReport, log: Log) -> CalibratedFrames:
-    """Decode and calibrate all frames; a camera that no file describes is refined with all of them."""
-    frames = calibrate_frames(config, inputs, log)
-    _require_clouds(config, inputs, frames.results, make_report)
-    start = inputs.cameras.start
-    if start is None:
-        return frames
-    job, results, camera = refine_camera(frames.job, frames.results, start, log)
-    results = run_frame_stage_again(config, job, inputs.captures, results)
-    _require_clouds(config, inputs, results, make_report)
-    notes = inputs.notes.with_camera(camera.sentence(), camera.document())
-    return replace(frames, job=job, results=results, notes=notes)
+        Raises UserError if fewer than two frames were.
+        """
+        frames = calibrate_frames(self.config, self.inputs, self.log)
+        self._require_clouds(frames.results)
+        start = self.inputs.cameras.start
+        if start is None:
+            return frames
+        job, results, camera = refine_camera(frames.job, frames.results, start, self.log)
+        results = run_frame_stage_again(self.config, job, self.inputs.captures, results)
+        self._require_clouds(results)
+        notes = self.inputs.notes
+        notes = replace(notes, sentences=(*notes.sentences, camera.sentence()), camera=camera.document())
+        return replace(frames, job=job, results=results, notes=notes)
 
+    def _require_clouds(self, results: Sequence[FrameStageResult]) -> None:
+        usable = len(clouds_of(results))
+        if usable < FEWEST_FRAMES:
+            result = summarise(self.config, self.inputs.job.decoder.name, results, None, None)
+            raise too_few_frames(result, usable, self.make_report)
 
-def _wrong_intrinsics(inputs: Inputs, frames: CalibratedFrames, log: Log) -> str:
-    """Which of the stated intrinsics the frames contradict; "" if none, or if they were found from the frames."""
-    if frames.found is not None or inputs.cameras.start is not None:
-        return ""
-    wrong = contradiction_by_epipolar_geometry(frames.job, frames.results)
-    if wrong:
-        log(wrong)
-    return wrong
+    def wrong_intrinsics(self, frames: CalibratedFrames) -> str:
+        """Which of the stated intrinsics the frames contradict; "" if none, or if they were found from the frames."""
+        if frames.found is not None or self.inputs.cameras.start is not None:
+            return ""
+        wrong = contradiction_by_epipolar_geometry(frames.job, frames.results)
+        if wrong:
+            self.log(wrong)
+        return wrong
 
+    def registered(self, frames: CalibratedFrames) -> tuple[CalibratedFrames, Registration]:
+        """The frames with the pose of each projector that the others decide for, and the registration of these."""
+        clouds, registration, given = clouds_of(frames.results), frames.registration, self.given(frames.results)
+        if self.inputs.known is not None:
+            require_known_frames(self.inputs.known, clouds)
+        if registration is None:
+            config, log = self.config, self.log
+            settings = config.unordered, config.seed, None if given is None else given.T_world_camera
+            chosen, registration = StageStore(frames.job.work, log).kept(
+                "registration", (clouds, *settings), lambda: register_clouds(clouds, *settings, log)
+            )
+            frames = replace(frames, results=with_clouds(frames.results, chosen_clouds(clouds, chosen)))
+            if config.rig == "rigid":
+                registration = with_equal_baselines(registration)
+        self.log(f"registered {int(registration.registered.sum())} of {len(clouds)} frames")
+        return frames, registration
 
-def _register(
-    config: ProcessConfig, inputs: Inputs, frames: CalibratedFrames, given: GivenPoses | None, log: Log
-) -> tuple[CalibratedFrames, Registration]:
-    """The frames with the pose of each projector that the others decide for, and the registration of these."""
-    clouds, registration = clouds_of(frames.results), frames.registration
-    if inputs.known is not None:
-        require_known_frames(inputs.known, clouds)
-    if registration is None:
-        settings = config.unordered, config.seed, None if given is None else given.T_world_camera
-        chosen, registration = StageStore(frames.job.work, log).kept(
-            "registration", (clouds, *settings), lambda: register_clouds(clouds, *settings, log)
+    def require_registered(self, results: Sequence[FrameStageResult], registration: Registration, wrong: str) -> None:
+        """Raise UserError if fewer than two frames were registered, or fewer than two of those with given poses.
+
+        `wrong`: which intrinsics the frames contradict, or "": then this is the cause.
+        """
+        usable = int(registration.registered.sum())
+        if usable < FEWEST_FRAMES:
+            decoder = self.inputs.job.decoder.name
+            result = summarise(self.config, decoder, results, registration, None, contradicted=wrong)
+            raise too_few_frames(result, usable, self.make_report)
+        if self.inputs.given is not None:
+            require_given_poses(self.config, self.inputs.given, results, registration)
+
+    def adjusted(
+        self, frames: CalibratedFrames, registration: Registration
+    ) -> tuple[CalibratedFrames, ConsistentFrames]:
+        """All registered frames adjusted together, and with them a projector that was found from the frames."""
+        config, log = self.config, self.log
+        clouds, found = clouds_of(frames.results), frames.found
+        settings = adjustment_settings(config.rig, found)
+        if config.no_adjust:
+            consistent = registered_only(clouds, registration)
+        else:
+            consistent = StageStore(frames.job.work, log).kept(
+                "adjustment",
+                (clouds, registration, settings),
+                lambda: adjust_consistent(clouds, registration, log, settings),
+            )
+        if found is None or config.rig == "static-projector":  # whose placement has adjusted everything
+            return frames, consistent
+        clouds, consistent, found = refine_projector(
+            clouds, consistent, found, self.inputs.job.stated.camera, settings, log
         )
-        frames = replace(frames, results=with_clouds(frames.results, chosen_clouds(clouds, chosen)))
-        if config.rig == "rigid":
-            registration = with_equal_baselines(registration)
-    log(f"registered {int(registration.registered.sum())} of {len(clouds)} frames")
-    return frames, registration
+        log(f"after the joint adjustment: {describe(found)}")
+        job, results = replace(frames.job, projector=found.projector), with_clouds(frames.results, clouds)
+        return replace(frames, job=job, results=results, found=found), consistent
 
+    def registered_by_what_moves(
+        self, frames: CalibratedFrames, consistent: ConsistentFrames
+    ) -> tuple[CalibratedFrames, ConsistentFrames, MovingPart | None]:
+        """The frames registered by what moves, where cameras in one place look at something that does, and what it is.
 
-def _adjust(
-    config: ProcessConfig, inputs: Inputs, frames: CalibratedFrames, registration: Registration, log: Log
-) -> tuple[CalibratedFrames, ConsistentFrames]:
-    """All registered frames adjusted together, and with them a projector that was found from the frames."""
-    clouds, found = clouds_of(frames.results), frames.found
-    settings = adjustment_settings(config.rig, found)
-    if config.no_adjust:
-        consistent = registered_only(clouds, registration)
-    else:
-        consistent = StageStore(frames.job.work, log).kept(
-            "adjustment",
-            (clouds, registration, settings),
-            lambda: adjust_consistent(clouds, registration, log, settings),
+        They stay as they are where nothing moves, and where what moves does not agree with itself.
+        """
+        part = moving_part(frames.results, consistent)
+        if part is None or frames.registration is not None:  # a still projector was placed by what stands still
+            return frames, consistent, part
+        self.log(
+            f"all cameras are in one place, and {part.share:.0%} of the decoded pixels show something that moves: "
+            f"turntable with a static background. Registering what moves alone; masks of it: {frames.job.work / MASKS}"
         )
-    if found is None or config.rig == "static-projector":  # whose placement has adjusted everything
-        return frames, consistent
-    refined = refine_projector(clouds, consistent, found, inputs.job.stated.camera, settings, log)
-    log(f"after the joint adjustment: {describe(refined.found)}")
-    job = replace(frames.job, projector=refined.found.projector)
-    results = with_clouds(frames.results, refined.clouds)
-    return replace(frames, job=job, results=results, found=refined.found), refined.consistent
-
-
-def _register_what_moves(
-    config: ProcessConfig, inputs: Inputs, frames: CalibratedFrames, consistent: ConsistentFrames, log: Log
-) -> tuple[CalibratedFrames, ConsistentFrames, MovingPart | None]:
-    """The frames registered by what moves, where cameras in one place look at something that does, and what that is.
-
-    They stay as they are where nothing moves, and where what moves does not agree with itself.
-    """
-    part = moving_part(frames.results, consistent)
-    if part is None or frames.registration is not None:  # a projector that stands still was placed by what stands still
+        rigid = part.rigid and self.config.rig == "free" and not self.config.no_adjust
+        run = replace(self, config=replace(self.config, rig="rigid")) if rigid else self
+        alone = only_moving(frames, part, rigid)
+        if len(clouds_of(alone.results)) >= FEWEST_FRAMES:
+            alone, registration = run.registered(alone)
+            if registration.registered.sum() >= FEWEST_FRAMES:
+                alone, found = run.adjusted(alone, registration)
+                if agrees_with_itself(found, alone.results):
+                    return alone, found, replace(part, registered=True)
+        self.log(
+            "what moves could not be registered; leave the background out with --masks, or cover it and capture again"
+        )
         return frames, consistent, part
-    log(
-        f"all cameras are in one place, and {part.share:.0%} of the decoded pixels show something that moves: "
-        f"turntable with a static background. Registering what moves alone; masks of it: {frames.job.work / MASKS}"
-    )
-    rigid = part.rigid and config.rig == "free" and not config.no_adjust
-    config, alone = replace(config, rig="rigid") if rigid else config, only_moving(frames, part, rigid)
-    if len(clouds_of(alone.results)) >= FEWEST_FRAMES:
-        alone, registration = _register(config, inputs, alone, _given(inputs, alone.results), log)
-        if registration.registered.sum() >= FEWEST_FRAMES:
-            alone, found = _adjust(config, inputs, alone, registration, log)
-            if agrees_with_itself(found, alone.results):
-                return alone, found, replace(part, registered=True)
-    log("what moves could not be registered; leave the background out with --masks, or cover it and capture again")
-    return frames, consistent, part
+
+    def written(
+        self,
+        folder: NewFolder,
+        frames: CalibratedFrames,
+        consistent: ConsistentFrames,
+        moving: MovingPart | None,
+        wrong: str,
+    ) -> ProcessResult:
+        """Judge the adjusted frames, and write the scan with its report."""
+        config, results = self.config, frames.results
+        registration, adjusted = consistent.registration, within_stated_doubt(consistent.adjusted, frames.job.stated)
+        poses = find_scan_poses(clouds_of(results), registration, adjusted, self.inputs.known, self.given(results))
+        parts, cross, shown = None, consistent.cross, registration
+        if config.object_only:
+            parts = find_object_only(frames.job, results, registration, poses)
+            self.log("object only: " + "\n    ".join(object_sentences(parts)))
+            poses = replace(poses, scale=parts.usable_scale(poses.scale))
+            shown, results = only_object(registration, results, parts)
+            enough = shown.registered.sum() >= FEWEST_FRAMES
+            cross = compare_registered(clouds_of(results), shown, adjusted, not config.no_adjust) if enough else None
+        shares = () if cross is None else _surface_shares(frames.job, results, shown, adjusted.poses, parts)
+        result = summarise(
+            config, self.inputs.job.decoder.name, frames.results, registration, poses, cross, shares, frames.found,
+            wrong, frames.notes, parts, moving,
+        )  # fmt: skip
+        write_scan(folder, frames.job, frames.results, poses, result, self.inputs.pictures, self.make_report)
+        return result
 
 
 def register_clouds(
@@ -449,32 +462,3 @@ def _surface_shares(
     shared = shared_surface(cameras, job.projector, chosen, coords, masks)
     missing = missing_shares(cameras, job.projector, chosen, shared.points, (clouds[k].seen for k in index))
     return [SurfaceShares(*both) for both in zip(shared.decoded, missing, strict=True)]
-
-
-def _require_clouds(
-    config: ProcessConfig, inputs: Inputs, results: Sequence[FrameStageResult], make_report: MakeReport
-) -> None:
-    """Raise UserError if fewer than two frames were decoded and calibrated."""
-    usable = len(clouds_of(results))
-    if usable < FEWEST_FRAMES:
-        raise too_few_frames(summarise(config, inputs.job.decoder.name, results, None, None), usable, make_report)
-
-
-def _require_registered(
-    config: ProcessConfig,
-    inputs: Inputs,
-    results: Sequence[FrameStageResult],
-    registration: Registration,
-    wrong: str,
-    make_report: MakeReport,
-) -> None:
-    """Raise UserError if fewer than two frames were registered, or fewer than two of those with given poses.
-
-    `wrong`: which intrinsics the frames contradict, or "": then this is the cause.
-    """
-    usable = int(registration.registered.sum())
-    if usable < FEWEST_FRAMES:
-        result = summarise(config, inputs.job.decoder.name, results, registration, None, contradicted=wrong)
-        raise too_few_frames(result, usable, make_report)
-    if inputs.given is not None:
-        require_given_poses(config, inputs.given, results, registration)

@@ -33,6 +33,7 @@ from sl_nerfstudio.processing.frames import (
     capture_sentences,
     clouds_of,
     describe_frame_stage,
+    matches_of,
     run_frame_stage,
     run_frame_stage_again,
     with_kept_cloud,
@@ -53,7 +54,7 @@ from sl_nerfstudio.relative_pose.estimation import (
     estimate_relative_pose,
     relative_pose_near,
 )
-from sl_nerfstudio.relative_pose.intrinsics import Explanation, IntrinsicsEvidence, Role, check_intrinsics
+from sl_nerfstudio.relative_pose.intrinsics import Explanation, IntrinsicsEvidence, check_intrinsics
 from sl_nerfstudio.relative_pose.joint_fit import CX, CY, K1, LOG_ASPECT, LOG_FOCAL, FrameMatches
 from sl_nerfstudio.relative_pose.unknown_projector import (
     DOUBTFUL_SIGMA,
@@ -121,10 +122,13 @@ def wrong_intrinsics(evidence: IntrinsicsEvidence, shrink: int = 1) -> str:
     )
     if len(found) == 1:
         (one,) = found
+        remedy = "find the projector's from the captures: --estimate-projector"
+        if one.role == "camera":
+            remedy = "calibrate the camera again at this zoom, focus and image size (sl-calibrate --camera-only)"
         return (
             f"{head} One change explains it, and no other that was tried does: {one.role}, {_values(one)}\n"
             f"    cause:  the {one.role}'s {one.part} is not as stated (another zoom, focus, lens shift, size?)\n"
-            f"    remedy: {_remedy(one.role)}"
+            f"    remedy: {remedy}"
         )
     return "\n".join(
         [
@@ -152,12 +156,6 @@ def _values(one: Explanation) -> str:
             f"instead of ({device.cx:.1f}, {device.cy:.1f})"
         )
     return ", ".join(words)
-
-
-def _remedy(role: Role) -> str:
-    if role == "camera":
-        return "calibrate the camera again at this zoom, focus and image size (sl-calibrate --camera-only)"
-    return "find the projector's from the captures: --estimate-projector"
 
 
 def static_doubt(sigma_focal: float, frames: int) -> str:
@@ -299,15 +297,6 @@ _ROUNDS = 3
 _NEGLIGIBLE = 0.5  # chi square of three values: the change is well within its uncertainty
 
 
-@dataclass(frozen=True)
-class RefinedProjector:
-    """Everything that follows from the projector, as the joint adjustment leaves it."""
-
-    clouds: Sequence[FrameCloud]
-    consistent: ConsistentFrames
-    found: FoundProjector
-
-
 _MOVES: dict[Rig, RefinePoses] = {"free": "free", "rigid": "rigid-rig", "static-projector": "static-projector"}
 
 
@@ -331,11 +320,12 @@ def refine_projector(
     camera_sigma: Shares,
     settings: RegisteredFramesSettings,
     log: Callable[[str], None],
-) -> RefinedProjector:
+) -> tuple[Sequence[FrameCloud], ConsistentFrames, FoundProjector]:
     """Gauss-Newton steps of focal length and principal point, with all poses adjusted again after each.
 
-    A step is kept if less of a contradiction is left than before. `camera_sigma`: how uncertain the camera is; what
-    follows from it is part of the projector's uncertainty.
+    Returns the clouds, what follows from them, and the projector. A step is kept if less of a contradiction is left
+    than before. `camera_sigma`: how uncertain the camera is; what follows from it is part of the projector's
+    uncertainty.
     """
     projector, covariance = found.projector, None  # None: no step was taken
     for _ in range(_ROUNDS):
@@ -355,7 +345,7 @@ def refine_projector(
         if left is None or not left.known or _chi_square(left) >= chi_square:
             break
         clouds, consistent, projector, covariance = new_clouds, again, new, _covariance(left, camera_sigma)
-    return RefinedProjector(clouds, consistent, _with_sigma(found, projector, covariance))
+    return clouds, consistent, _with_sigma(found, projector, covariance)
 
 
 def _chi_square(calibration: SelfCalibration) -> float:
@@ -460,13 +450,11 @@ def contradiction_by_epipolar_geometry(job: FrameJob, results: Sequence[FrameSta
     every = clouds_of(results)
     firm = _firm(every)
     clouds = firm if len(firm) >= FEWEST_FRAMES else every  # of two, four constraints on three values
-    if len(clouds) < FEWEST_FRAMES or len({cloud.camera for cloud in clouds}) > 1:
+    if len({cloud.camera for cloud in clouds}) > 1:
         return ""
-    clouds = _without_repeats(clouds)
-    if len(clouds) < FEWEST_FRAMES:
+    frames, poses = matches_of(_without_repeats(clouds))
+    if len(frames) < FEWEST_FRAMES:
         return ""
-    frames = [FrameMatches(c.name, *correspondences_of(c.coords), c.camera) for c in clouds]
-    poses = [(c.pose.T_camera_projector[:3, :3], c.pose.T_camera_projector[:3, 3]) for c in clouds]
     evidence = StageStore(job.work).kept(
         "test of intrinsics",
         (frames, poses, job.projector, job.seed),
@@ -597,17 +585,14 @@ def _registration(
     """
     n = len(names)
     if n < FEWEST_FRAMES:
-        one = np.full(n, np.nan)
-        exclusions = tuple(NoCommonSurface(name) for name in names)
-        return Registration(
-            tuple(names), np.full((n, 4, 4), np.nan), one, np.zeros(n, bool), np.full(n, -1), one, (), exclusions, ()
-        )
+        alone = tuple(map(NoCommonSurface, names))
+        T, one, inside, component = np.full((n, 4, 4), np.nan), np.full(n, np.nan), np.zeros(n, bool), np.full(n, -1)
+        return Registration(tuple(names), T, one, inside, component, one, (), alone, ())
     scale = 1 / np.exp(np.log(baseline).mean())
     T = np.linalg.inv(T_world_camera[0]) @ T_world_camera
     T[:, :3, 3] *= scale
-    return Registration(
-        tuple(names), T, scale * baseline, np.ones(n, bool), np.zeros(n, np.int64), np.ones(n), (), (), ()
-    )
+    inside, component, fitness = np.ones(n, bool), np.zeros(n, np.int64), np.ones(n)
+    return Registration(tuple(names), T, scale * baseline, inside, component, fitness, (), (), ())
 
 
 # All frames, with what is known of the projector and of the rig.

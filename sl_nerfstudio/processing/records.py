@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import fields, is_dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -60,22 +60,13 @@ class DecodedStore:
                 light, notes = stored.get("light"), tuple(map(str, stored.get("notes", ())))
         except (ValueError, KeyError, EOFError, BadZipFile):
             return None
-        if coords.dtype != np.float32 or coords.shape != (*mask.shape, 2) or pattern.shape != mask.shape:
-            return None
-        if light is not None and light.shape != mask.shape:
+        same = all(one.shape == mask.shape for one in (pattern, light) if one is not None)
+        if coords.dtype != np.float32 or coords.shape != (*mask.shape, 2) or not same:
             return None
         return _restored(coords, mask, pattern, light, notes)
 
-    def load_mask(self, frame: CapturedFrame, key: str) -> Bool[ndarray, "h w"] | None:
-        """The mask alone of a frame that was decoded before."""
-        return self._member(frame, key, "mask")
-
-    def load_image(self, frame: CapturedFrame, key: str) -> Pixels | None:
-        """The photograph that was stored with a decoded frame; None if none was."""
-        return self._member(frame, key, "image")
-
-    def _member(self, frame: CapturedFrame, key: str, name: str) -> ndarray | None:
-        """One array of a file, whose own sum is checked; None if it is missing or damaged."""
+    def load_one(self, frame: CapturedFrame, key: str, name: Literal["mask", "image"]) -> ndarray | None:
+        """One array of a frame that was decoded before, by its own check sum; None if it is missing or damaged."""
         try:
             with np.load(self._path(frame, key), allow_pickle=False) as stored:
                 return stored[name]
@@ -132,12 +123,17 @@ class Manifest:
 
 
 def _manifest(path: Path) -> dict[str, dict[str, Any]]:
-    """The objects in the notes of an earlier run; none if there are none that can be read."""
+    """The objects in the notes of an earlier run."""
+    return {key: value for key, value in read_note(path).items() if isinstance(value, dict)}
+
+
+def read_note(path: Path) -> dict[str, Any]:
+    """What an earlier run noted as JSON; empty if there is nothing that can be read."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        found = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
         return {}
-    return {k: v for k, v in found.items() if isinstance(v, dict)} if isinstance(found, dict) else {}
+    return found if isinstance(found, dict) else {}
 
 
 # Dataclasses with arrays as bytes, exactly, and without pickle: reading them runs no code.

@@ -324,14 +324,13 @@ def _lost(frames: Sequence[FrameRecord]) -> list[str]:
             together.setdefault(key, []).append(frame)
     sentences = []
     for (component, _), group in together.items():
-        names, why = ", ".join(f.name for f in group), f"left out ({first_line(group[0].reason)})"
+        advice = "capture them again; each"
         if len(group) == 1:
-            sentences.append(f"{names}: capture it again; it was {why}")
+            advice = "capture it again; it"
         elif component > 0:
-            connect = f"capture views that connect this group {component} with the scan"
-            sentences.append(f"{names}: {connect}; {group[0].name} was {why}")
-        else:
-            sentences.append(f"{names}: capture them again; each was {why}")
+            advice = f"capture views that connect this group {component} with the scan; {group[0].name}"
+        names = ", ".join(frame.name for frame in group)
+        sentences.append(f"{names}: {advice} was left out ({first_line(group[0].reason)})")
     return sentences
 
 
@@ -347,43 +346,42 @@ def _gaps(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord], ordered: b
             f"between {a} and {b}: add a frame; the two share too little of the surface to be registered directly"
             for a, b in unconnected_neighbours(frames, edges)
         ]
-    used = _used(edges)
-    present = [f.name for f in frames if f.in_scan]
+    present, used = _present_and_used(frames, edges)
     single = [name for name in present if sum(name in pair for pair in used) == 1 and len(present) > 2]
     return [f"near {name}: add a frame; only one other frame overlaps it" for name in single]
 
 
 def unconnected_neighbours(frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord]) -> list[tuple[str, str]]:
     """Frames of the scan that follow each other, but were not registered with each other."""
-    used = _used(edges)
-    present = [f.name for f in frames if f.in_scan]
+    present, used = _present_and_used(frames, edges)
     return [(a, b) for a, b in pairwise(present) if frozenset((a, b)) not in used]
 
 
-def _used(edges: Sequence[EdgeRecord]) -> set[frozenset[str]]:
-    return {frozenset(edge.frames) for edge in edges if edge.used}
+def _present_and_used(
+    frames: Sequence[FrameRecord], edges: Sequence[EdgeRecord]
+) -> tuple[list[str], set[frozenset[str]]]:
+    """The frames of the scan, and the pairs that were used."""
+    return [f.name for f in frames if f.in_scan], {frozenset(edge.frames) for edge in edges if edge.used}
 
 
 def _weak(frame: FrameRecord) -> list[str]:
     """What makes a frame of the scan unreliable."""
-    advice = [f"{frame.name}: {degeneracy}" for degeneracy in frame.degeneracies]
+    advice = list(frame.degeneracies)
     shared = frame.shared_decoded is not None
     rate, what = (frame.shared_decoded, "surface that other frames show") if shared else (frame.decode_rate, "pattern")
     if rate is not None and rate < _LOW_RATE:
         advice.append(
-            f"{frame.name}: only {rate:.0%} of the {what} was decoded; focus better, use more light from "
-            "the projector and less from the room, and expose so that lines are neither faint nor saturated"
+            f"only {rate:.0%} of the {what} was decoded; focus better, use more light from the projector and less from "
+            "the room, and expose so that lines are neither faint nor saturated"
         )
     if frame.mask_share is not None and frame.mask_share < _SMALL_SHARE:
-        advice.append(
-            f"{frame.name}: the pattern fills only {frame.mask_share:.1%} of the image; go closer, or aim better"
-        )
+        advice.append(f"the pattern fills only {frame.mask_share:.1%} of the image; go closer, or aim better")
     if frame.fitness is not None and frame.fitness < _POOR_FITNESS:
         advice.append(
-            f"{frame.name}: only {frame.fitness:.0%} of its points agree with the frames it overlaps; something moved, "
-            "or its pose is uncertain: capture it again"
+            f"only {frame.fitness:.0%} of its points agree with the frames it overlaps; something moved, or its pose "
+            "is uncertain: capture it again"
         )
-    return advice
+    return [f"{frame.name}: {one}" for one in advice]
 
 
 # From the results of the stages to what the report shows.
@@ -434,6 +432,19 @@ def summarise(
     adjusted = None if poses is None else poses.adjusted
     wrong = contradicted or _contradiction(results, adjusted)
     placed = place_frames(results, registration, poses)
+    decided = [e for e in pairs if e.used or not e.undecided]
+    facts = ScanFacts(
+        frames,
+        tuple(PairFacts(e.frames, e.used, support_of(e.overlap, e.fitness)) for e in decided),
+        cross,
+        bool(wrong),
+        () if registration is None else registration.turns_deg,
+        registration is not None and registration.by_order,
+        None if moving is None else moving.share,
+        moving is not None and moving.registered,
+        () if adjusted is None else other_places(adjusted.modes, [cloud.name for cloud in clouds_of(results)]),
+        adjusted=not config.no_adjust,
+    )
     return ProcessResult(
         config=config,
         decoder=decoder,
@@ -450,26 +461,7 @@ def summarise(
         recapture=what_to_recapture(frames, pairs, not config.unordered),
         joint_px=None if adjusted is None else _both_known(adjusted.median_before_px, adjusted.median_after_px),
         cross_px=None if cross is None else _both_known(cross.px_median, cross.px_p95),
-        verdict=judge_scan(
-            ScanFacts(
-                frames,
-                tuple(
-                    PairFacts(e.frames, e.used, support_of(e.overlap, e.fitness))
-                    for e in pairs
-                    if e.used or not e.undecided
-                ),
-                cross,
-                bool(wrong),
-                () if registration is None else registration.turns_deg,
-                registration is not None and registration.by_order,
-                None if moving is None else moving.share,
-                moving is not None and moving.registered,
-                ()
-                if adjusted is None
-                else other_places(adjusted.modes, [r.name for r in results if r.cloud is not None]),
-                adjusted=not config.no_adjust,
-            )
-        ).with_help(HELP),
+        verdict=judge_scan(facts).with_help(HELP),
         projector=found,
         contradiction=wrong,
         object_only=parts,
@@ -492,10 +484,9 @@ def _with_others(
             agreement, own = next(found)
             figures = {"cross_share": agreement.share, "cross_px_median": agreement.px_median,
                        "cross_px_p95": agreement.px_p95, "cross_excess": agreement.excess}  # fmt: skip
-            known = {key: value for key, value in figures.items() if np.isfinite(value)}
-            frame = replace(
-                frame, seen_share=agreement.seen, shared_decoded=own.decoded, missing_share=own.missing, **known
-            )
+            known: dict[str, float | None] = {key: value for key, value in figures.items() if np.isfinite(value)}
+            known |= {"seen_share": agreement.seen, "shared_decoded": own.decoded, "missing_share": own.missing}
+            frame = replace(frame, **known)
         out.append(frame)
     return tuple(out)
 
@@ -505,9 +496,7 @@ def _contradiction(results: Sequence[FrameStageResult], adjusted: AdjustedFrames
     clouds = clouds_of(results)
     if adjusted is None or not clouds or repeat_each_other(adjusted.poses, clouds):
         return ""
-    cameras = [
-        cloud.camera.scaled(float(result.frame.shrink)) for result in results if (cloud := result.cloud) is not None
-    ]
+    cameras = [cloud.camera.scaled(float(results[0].frame.shrink)) for cloud in clouds]  # one factor for all frames
     return contradiction(adjusted.intrinsics, cameras, clouds[0].projector)
 
 

@@ -99,9 +99,8 @@ class PlacedGroup:
 
     def only_object(self, parts: dict[str, UInt8[ndarray, "h w"]]) -> "PlacedGroup":
         """Leave out the points of surroundings. `parts` is what each pixel shows (`Part`), by the frame's name."""
-        return replace(
-            self, frames=tuple(_only_object(f, parts[f.name]) if f.name in parts else f for f in self.frames)
-        )
+        frames = (_only_object(f, parts[f.name]) if f.name in parts else f for f in self.frames)
+        return replace(self, frames=tuple(frames))
 
 
 def place_frames(
@@ -121,16 +120,12 @@ def _groups(
 ) -> Iterator[PlacedGroup]:
     if registration is None:
         return
-    inside = registration.registered if poses is not None else np.zeros(len(clouds), dtype=bool)
+    inside = registration.registered & (poses is not None)
     if poses is not None:
-        devices = poses.adjusted.poses
-        yield PlacedGroup(
-            0,
-            tuple(
-                _at(clouds[k], devices.T_world_camera[k], devices.T_world_projector[k], most)
-                for k in np.flatnonzero(inside).tolist()
-            ),
-        )
+        T = poses.adjusted.poses
+        chosen = np.flatnonzero(inside).tolist()
+        placed = (_at(clouds[k], T.T_world_camera[k], T.T_world_projector[k], most) for k in chosen)
+        yield PlacedGroup(0, tuple(placed))
     by_name = {cloud.name: k for k, cloud in enumerate(clouds)}
     for separate in registration.separate:
         left = [(by_name[name], i) for i, name in enumerate(separate.frames) if not inside[by_name[name]]]
@@ -154,13 +149,10 @@ def _at(
     uv = cloud.uv_camera[good[np.linspace(0, len(good) - 1, min(most, len(good))).astype(np.int64)]]
     column, row = np.floor(uv).astype(np.int64).T
     found = triangulate(
-        Intrinsics.of(cloud.camera, torch.float64),
-        torch.from_numpy(T_world_camera),
-        torch.from_numpy(uv),
-        Intrinsics.of(cloud.projector, torch.float64),
-        torch.from_numpy(T_world_projector),
+        Intrinsics.of(cloud.camera, torch.float64), torch.from_numpy(T_world_camera), torch.from_numpy(uv),
+        Intrinsics.of(cloud.projector, torch.float64), torch.from_numpy(T_world_projector),
         torch.from_numpy(cloud.coords[row, column].astype(np.float64)),
-    )
+    )  # fmt: skip
     seen = (found.depth_camera > 0).numpy()
     points = found.p_world.numpy()[seen].astype(np.float32)
     return PlacedFrame(cloud.name, cloud.camera, cloud.projector, T_world_camera, T_world_projector, points, uv[seen])

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
@@ -39,26 +38,24 @@ def only_moving(frames: CalibratedFrames, part: MovingPart, rigid: bool) -> Cali
     which hardly anything moves are left out. Raises UserError if no pose fits all frames.
     """
     folder, kept, sizes = frames.job.work / MASKS, LargeClouds(), {}
+    results = {result.name: result for result in frames.results}
     shown = [result for result in frames.results if result.cloud is not None]
-    results = [result for result in frames.results if result.cloud is None]
     for result, mask in zip(with_one_pose(frames.job, shown) if rigid else shown, part.masks, strict=True):
+        results[result.name] = result
         if result.cloud is None:
-            results.append(result)
             continue
+        photograph = result.frame.images[0]
         try:
-            result = with_kept_cloud(replace(result, cloud=_masked(result.cloud, mask)), kept)
+            results[result.name] = with_kept_cloud(replace(result, cloud=_masked(result.cloud, mask)), kept)
         except RelativePoseError:
-            results.append(result.failed("registering", _NOTHING_MOVES.format(result.frame.images[0])))
+            results[result.name] = result.failed("registering", _NOTHING_MOVES.format(photograph))
             continue
-        header = photograph_header(result.frame.images[0])
+        header = photograph_header(photograph)
         sizes[result.name] = header.w, header.h
-        write_mask(folder / f"{result.name}.png", _as_photographed(mask, sizes[result.name], result.frame.shrink))
-        results.append(result)
+        whole = _as_photographed(mask, sizes[result.name], result.frame.shrink)
+        write_atomic(folder / f"{result.name}.png", encode_png(255 * whole.astype(np.uint8)))
     masks = find_masks(folder, sizes, frames.job.shrink) if sizes else frames.job.masks
-    by_name = {result.name: result for result in results}
-    return replace(
-        frames, job=replace(frames.job, masks=masks), results=[by_name[result.name] for result in frames.results]
-    )
+    return replace(frames, job=replace(frames.job, masks=masks), results=list(results.values()))
 
 
 _NOTHING_MOVES = (
@@ -66,12 +63,6 @@ _NOTHING_MOVES = (
     "    cause:  a turntable with a static background, and an object that is hidden, or not turned in this frame\n"
     "    remedy: capture this view again; cover the background"
 )
-
-
-def write_mask(path: Path, mask: Bool[ndarray, "h w"]) -> None:
-    """Write the mask of a frame, white where it is used."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomic(path, encode_png(255 * mask.astype(np.uint8)))
 
 
 def _as_photographed(mask: Bool[ndarray, "a b"], size: tuple[int, int], shrink: int) -> Bool[ndarray, "h w"]:

@@ -44,20 +44,6 @@ class FrameMeasure:
     moved: float  # since the frame before, share of the image's diagonal
 
 
-class VideoMeter:
-    """Measures one frame after the other."""
-
-    def __init__(self) -> None:
-        self._before: UInt8[ndarray, "h w"] | None = None
-
-    def measure(self, number: int, time_s: float, grey: UInt8[ndarray, "h w"]) -> FrameMeasure:
-        """Sharpness of a frame, and its motion since the frame before; 0 for the first."""
-        small = _resized(grey, _SMALL)
-        moved = 0.0 if self._before is None or self._before.shape != small.shape else _motion(self._before, small)
-        self._before = small
-        return FrameMeasure(number, time_s, sharpness(grey), moved)
-
-
 def sharpness(grey: UInt8[ndarray, "h w"]) -> float:
     """Detail between 1 and 2 pixels against that between 2 and 4: about 0.7 for sharp edges, 0.25 for blurred ones.
 
@@ -177,7 +163,7 @@ def video_frames(path: Path, work: Path) -> tuple[Path, VideoChoice]:
     if kept is None:
         kept = _choose(path, list(track(_measures(path), "reading the video")))
         numbers = {frame.number: frame.name for frame in kept.chosen}
-        for number, pixels in track(_pixels(path), "keeping frames", kept.frames_in_video):
+        for number, _, pixels in track(_decoded(path, "rgb24"), "keeping frames", kept.frames_in_video):
             if number in numbers:
                 write_atomic(folder / f"{numbers[number]}.png", encode_png(pixels))
         write_atomic(folder / _RECORD, encode_json(kept.document()))
@@ -236,14 +222,13 @@ def _choose(path: Path, measures: Sequence[FrameMeasure]) -> VideoChoice:
 
 
 def _measures(path: Path) -> Iterator[FrameMeasure]:
-    meter = VideoMeter()
+    """Sharpness of every frame, and its motion since the frame before; 0 for the first."""
+    before = None
     for number, time_s, grey in _decoded(path, "gray"):
-        yield meter.measure(number, time_s, grey)
-
-
-def _pixels(path: Path) -> Iterator[tuple[int, UInt8[ndarray, "h w 3"]]]:
-    for number, _, pixels in _decoded(path, "rgb24"):
-        yield number, pixels
+        small = _resized(grey, _SMALL)
+        moved = 0.0 if before is None or before.shape != small.shape else _motion(before, small)
+        yield FrameMeasure(number, time_s, sharpness(grey), moved)
+        before = small
 
 
 def _decoded(path: Path, kind: str) -> Iterator[tuple[int, float, UInt8[ndarray, "h w *c"]]]:

@@ -21,7 +21,6 @@ from sl_nerfstudio.scan.check_geometry import Correspondences, GeometricFit, fit
 from sl_nerfstudio.scan.check_images import (
     CLEAR,
     ImageMatch,
-    MatchedFrame,
     Shown,
     has_detail,
     image_problems,
@@ -44,6 +43,7 @@ _SENTINELS = ((-1.0, -1.0), (0.0, 0.0))
 _MANY_EQUAL = 0.02  # share of the decoded pixels with one value; neighbours may share a coordinate, but not so many
 _FEW = 20
 _FEWEST_NEIGHBOURS = 200
+_WRITE_NAN = "write NaN where a pixel was not decoded"
 _NOISE = 0.7  # of a typical distance from the median; a surface across 16 pixels has 0.25, independent values 1 to 1.5
 
 
@@ -52,11 +52,8 @@ def coordinate_problems(coords: Float32[ndarray, "h w 2"], projector: Device | N
     x, y = coords[..., 0], coords[..., 1]  # separately: numpy is slow along an axis of two
     infinite = int((np.isinf(x) | np.isinf(y)).sum())
     if infinite:
-        yield Problem(
-            f"holds infinities at {infinite} pixels",
-            "a division by zero in the decoder, or a marker for 'not decoded'",
-            "write NaN where a pixel was not decoded",
-        )
+        cause = "a division by zero in the decoder, or a marker for 'not decoded'"
+        yield Problem(f"holds infinities at {infinite} pixels", cause, _WRITE_NAN)
         return
     has_x, has_y = ~np.isnan(x), ~np.isnan(y)
     half = int((has_x != has_y).sum())
@@ -110,16 +107,12 @@ def _sentinel_problem(values: Float32[ndarray, "n 2"]) -> Problem | None:
     """A value that stands for 'not decoded'."""
     pairs, counts = np.unique(np.ascontiguousarray(values).view(np.uint64).ravel(), return_counts=True)
     most = int(counts.argmax())
-    value = pairs[most : most + 1].view(np.float32)
-    count = int(counts[most])
+    value, count = pairs[most : most + 1].view(np.float32), int(counts[most])
     known = any((value == sentinel).all() for sentinel in _SENTINELS)
     if count <= _FEW or (not known and count <= _MANY_EQUAL * len(values)):
         return None
-    return Problem(
-        f"has the value ({value[0]:g}, {value[1]:g}) at {count} pixels",
-        "it stands for 'not decoded'" if known else "it stands for 'not decoded', or the file is a placeholder",
-        "write NaN where a pixel was not decoded",
-    )
+    cause = "it stands for 'not decoded'" + ("" if known else ", or the file is a placeholder")
+    return Problem(f"has the value ({value[0]:g}, {value[1]:g}) at {count} pixels", cause, _WRITE_NAN)
 
 
 def _range_problems(values: Float32[ndarray, "n 2"], projector: Device) -> Iterator[Problem]:
@@ -133,33 +126,27 @@ def _range_problems(values: Float32[ndarray, "n 2"], projector: Device) -> Itera
             "store pattern pixels: multiply by the pattern's size, x to the right and y down",
         )
         return
-    outside, absurd = _beyond(values, size, _OUTSIDE), _beyond(values, size, _ABSURD)
-    if outside.mean() > _MANY_OUTSIDE or absurd.any():
-        many = bool(outside.mean() > _MANY_OUTSIDE)
-        count = int(absurd.sum())
-        some = "1 pixel" if count == 1 else f"{count} pixels"
-        share = f"{100 * outside.mean():.0f} % of the pixels" if many else some
-        yield Problem(
-            f"puts {share} outside the pattern ({span})",
-            _outside_cause(values, size, many),
-            "store (x, y) in pixels of pattern.png, NaN where not decoded",
-        )
-    elif projector.model == "DOE":
-        yield from _doe_problems(values, projector)
+    outside, absurd = float(_beyond(values, size, _OUTSIDE).mean()), int(_beyond(values, size, _ABSURD).sum())
+    if outside > _MANY_OUTSIDE:
+        share = f"{100 * outside:.0f} % of the pixels"
+        cause = "they are coordinates of a pattern of another size, or in another unit"
+        if _beyond(values, size[::-1], _OUTSIDE).mean() <= _MANY_OUTSIDE:
+            cause = "x and y are swapped: the other way round they fit the pattern"
+    elif absurd:
+        share = "1 pixel" if absurd == 1 else f"{absurd} pixels"
+        cause = "a marker for 'not decoded', or a decoder that diverged"
+    else:
+        if projector.model == "DOE":
+            yield from _doe_problems(values, projector)
+        return
+    remedy = "store (x, y) in pixels of pattern.png, NaN where not decoded"
+    yield Problem(f"puts {share} outside the pattern ({span})", cause, remedy)
 
 
 def _beyond(values: Float32[ndarray, "n 2"], size: Float32[ndarray, "2"], margin: float) -> Bool[ndarray, "n"]:
     """Find values outside a pattern of `size` by more than `margin` sizes."""
     x, y = values[:, 0] / size[0], values[:, 1] / size[1]
     return (x < -margin) | (x > 1 + margin) | (y < -margin) | (y > 1 + margin)
-
-
-def _outside_cause(values: Float32[ndarray, "n 2"], size: Float32[ndarray, "2"], many: bool) -> str:
-    if not many:
-        return "a marker for 'not decoded', or a decoder that diverged"
-    if _beyond(values, size[::-1], _OUTSIDE).mean() <= _MANY_OUTSIDE:
-        return "x and y are swapped: the other way round they fit the pattern"
-    return "they are coordinates of a pattern of another size, or in another unit"
 
 
 def _doe_problems(values: Float32[ndarray, "n 2"], projector: Device) -> Iterator[Problem]:
@@ -198,15 +185,37 @@ class PatternImage:
     detailed: bool  # so that frames can be told by what they show of it
 
 
+@dataclass(frozen=True)
+class _Files:
+    """The files of a frame that can be decoded, by their keys, and where their faults are collected."""
+
+    paths: dict[str, Path]
+    root: Path
+    frame: str | None  # None: of all frames
+    faults: Faults
+
+    def read(self, key: str, read: Callable[[Path], ndarray] = read_image) -> ndarray | None:
+        """The pixels; None if there are none, or after adding a fault."""
+        try:
+            return read(self.paths[key]) if key in self.paths else None
+        except FileError as error:
+            self.add(error, key)
+            return None
+
+    def add(self, problem: Problem | FileError, key: str) -> None:
+        """Add a fault of one of the files."""
+        self.faults.add(problem, relative(self.paths[key], self.root), self.frame)
+
+
 def check_pattern(partial: PartialScan, good: set[Path], faults: Faults) -> PatternImage | None:
     """The projected pattern; None after adding a fault."""
-    if partial.pattern_path is None or partial.pattern_path not in good:
-        return None
-    pattern = _read_image(partial.pattern_path, partial, None, faults)
+    path = partial.pattern_path
+    files = _Files({"pattern": path} if path is not None and path in good else {}, partial.root, None, faults)
+    pattern = files.read("pattern")
     if pattern is None:
         return None
     if pattern.min() == pattern.max():
-        faults.add(_nothing_in_it("the pattern"), relative(partial.pattern_path, partial.root))
+        files.add(_nothing_in_it("the pattern"), "pattern")
         return None
     grey = as_grey(pattern)
     return PatternImage(grey, has_detail(grey))
@@ -216,33 +225,28 @@ def check_content(
     frame: PartialFrame, partial: PartialScan, pattern: PatternImage | None, good: set[Path], faults: Faults
 ) -> FrameContent:
     """Decode all files of a frame that are in `good`, and report what is wrong with their pixels."""
-    image_path, pattern_path, coords_path, mask_path = (
-        path if (path := frame.paths.get(key)) in good else None
-        for key in ("file_path", "sl_pattern_path", "sl_coords_path", "mask_path")
-    )
-    coords = None if coords_path is None else _check_coords(coords_path, frame, partial, faults)
-    mask = None if mask_path is None else _check_mask(mask_path, frame, partial, faults)
+    files = _Files({key: path for key, path in frame.paths.items() if path in good}, partial.root, frame.name, faults)
+    coords, mask = _check_coords(files, partial.projector), _check_mask(files)
     decoded = None if coords is None else np.isfinite(coords[..., 0])  # and so is the other, or it would be a fault
     where = decoded if mask is None else mask
-    both = None if decoded is None else (decoded if mask is None else decoded & mask)
-    if mask_path and mask is not None and decoded is not None and _excludes_all(mask, decoded):
-        problem = Problem(
-            "excludes every pixel that has coordinates",
-            "it is inverted, or is the mask of another frame",
-            "mark with 255 where the pattern falls on the object, with 0 elsewhere",
+    both = decoded if decoded is None or mask is None else decoded & mask
+    if mask is not None and decoded is not None and decoded.any() and both is not None and not both.any():
+        files.add(
+            Problem(
+                "excludes every pixel that has coordinates",
+                "it is inverted, or is the mask of another frame",
+                "mark with 255 where the pattern falls on the object, with 0 elsewhere",
+            ),
+            "mask_path",
         )
-        faults.add(problem, relative(mask_path, partial.root), frame.name)
-    image = None if image_path is None else _read_image(image_path, partial, frame.name, faults)
-    shown, shown_path = image, image_path
-    if "sl_pattern_path" in frame.paths:
-        shown_path = pattern_path
-        shown = None if pattern_path is None else _read_image(pattern_path, partial, frame.name, faults)
+    image = files.read("file_path")
+    shown_key = "sl_pattern_path" if "sl_pattern_path" in frame.paths else "file_path"
+    shown = image if shown_key == "file_path" else files.read(shown_key)
     compared = where if both is None else both
-    if shown is not None and shown_path is not None and compared is not None and compared.shape == shown.shape[:2]:
+    if shown is not None and compared is not None and compared.shape == shown.shape[:2]:
         inside = shown[compared]
         if inside.size and inside.min() == inside.max():
-            faults.add(_nothing_in_it("the image, where the mask is"), relative(shown_path, partial.root), frame.name)
-    digest = None if image is None or coords is None else _digest(image, coords)
+            files.add(_nothing_in_it("the image, where the mask is"), shown_key)
     shift = match = image_match = None
     if coords is not None and both is not None and where is not None and shown is not None and pattern is not None:
         grey = as_grey(shown)
@@ -251,13 +255,13 @@ def check_content(
             match = match_image(coords, both, pattern.grey, grey, where)
             if image is not None and shown is not image and image.shape[:2] == both.shape:
                 image_match = match_image(coords, both, pattern.grey, as_grey(image), where)
-    _check_color(frame, partial, match, where, good, faults)
+    _check_color(files, match, where)
     return FrameContent(
         frame.name,
-        digest,
+        None if image is None or coords is None else _digest(image, coords),
         0.0 if where is None else float(where.mean()),
         0.0 if both is None or where is None or not where.any() else float(both.sum() / where.sum()),
-        _correspondences(frame, partial, coords, both),
+        _correspondences(frame, partial.projector, coords, both),
         shift,
         match,
         image_match,
@@ -281,83 +285,63 @@ def duplicate_problems(contents: list[FrameContent]) -> Iterator[tuple[str, Prob
     """(frame, problem) of each frame with the same image and the same coordinates as an earlier one."""
     seen: dict[bytes, str] = {}
     for content in contents:
-        if content.digest is None:
-            continue
-        first = seen.setdefault(content.digest, content.name)
+        first = content.name if content.digest is None else seen.setdefault(content.digest, content.name)
         if first != content.name:
-            yield (
-                content.name,
-                Problem(
-                    f"has the same image and coordinates as frame {first}",
-                    "a frame was copied under another name",
-                    "remove the copy; a frame counted twice makes uncertainties look too small",
-                ),
+            problem = Problem(
+                f"has the same image and coordinates as frame {first}",
+                "a frame was copied under another name",
+                "remove the copy; a frame counted twice makes uncertainties look too small",
             )
+            yield content.name, problem
 
 
-def _check_coords(
-    path: Path, frame: PartialFrame, partial: PartialScan, faults: Faults
-) -> Float32[ndarray, "h w 2"] | None:
-    name = relative(path, partial.root)
-    try:
-        coords = read_coords(path)
-    except FileError as error:
-        faults.add(error, name, frame.name)
-        return None
-    problems = list(coordinate_problems(coords, partial.projector))
+def _check_coords(files: _Files, projector: Device | None) -> Float32[ndarray, "h w 2"] | None:
+    coords = files.read("sl_coords_path", read_coords)
+    problems = [] if coords is None else list(coordinate_problems(coords, projector))
     for problem in problems:
-        faults.add(problem, name, frame.name)
+        files.add(problem, "sl_coords_path")
     return None if problems else coords
 
 
-def _check_mask(path: Path, frame: PartialFrame, partial: PartialScan, faults: Faults) -> Bool[ndarray, "h w"] | None:
-    mask = _read_image(path, partial, frame.name, faults)
+def _check_mask(files: _Files) -> Bool[ndarray, "h w"] | None:
+    mask = files.read("mask_path")
     if mask is None:
         return None
     full = np.iinfo(mask.dtype).max
-    values = np.flatnonzero(np.bincount(mask.ravel(), minlength=2))
-    problem = None
-    if values.max() == 0:
+    values = np.flatnonzero(np.bincount(mask.ravel(), minlength=2)).tolist()
+    between = [value for value in values if value not in (0, full)]
+    if values == [0]:
         problem = Problem(
             "is 0 everywhere",
             "the pattern was not found in this image, or the mask was never drawn",
             "mark the pixels where the pattern falls on the object with 255, or leave the frame out",
         )
-    elif values.max() == 1:
+    elif values[-1] == 1:
         problem = Problem("has 0 and 1 instead of 0 and 255", "booleans were saved unchanged", "multiply it by 255")
-    elif not set(values.tolist()) <= {0, full}:
-        between = [value for value in values.tolist() if value not in (0, full)]
+    elif between:
         problem = Problem(
             f"has grey levels between black and white ({between[0]}{', ..' if len(between) > 1 else ''})",
             "it was resized or saved with lossy compression, or is another kind of image",
             f"save it with 0 and {full} only, without lossy compression",
         )
-    if problem is None:
+    else:
         return mask == full
-    faults.add(problem, relative(path, partial.root), frame.name)
+    files.add(problem, "mask_path")
     return None
 
 
-def _check_color(
-    frame: PartialFrame,
-    partial: PartialScan,
-    match: ImageMatch | None,
-    where: Bool[ndarray, "_ _"] | None,
-    good: set[Path],
-    faults: Faults,
-) -> None:
+def _check_color(files: _Files, match: ImageMatch | None, where: Bool[ndarray, "_ _"] | None) -> None:
     """The picture without the pattern: can it be decoded, and does it really not show the pattern?"""
-    path = frame.paths.get("sl_color_path")
-    color = _read_image(path, partial, frame.name, faults) if path is not None and path in good else None
-    if path is None or color is None:
+    color = files.read("sl_color_path")
+    if color is None:
         return
-    problem = None
     if color.min() == color.max():
         problem = Problem(
             "has the same value everywhere",
             "a covered lens, or a dark room while the projector was off",
             "take the picture in even light, or leave sl_color_path out",
         )
+        files.add(problem, "sl_color_path")
     elif match is not None and where is not None:
         correlation = match.prediction.correlation(as_grey(color), where)
         if correlation >= CLEAR:
@@ -366,20 +350,7 @@ def _check_color(
                 "it was taken with the pattern, or is another file",
                 "give the picture that was taken without the pattern, or leave sl_color_path out",
             )
-    if problem is not None:
-        faults.add(problem, relative(path, partial.root), frame.name)
-
-
-def _excludes_all(mask: Bool[ndarray, "h w"], decoded: Bool[ndarray, "_ _"]) -> bool:
-    return mask.shape == decoded.shape and bool(decoded.any()) and not (mask & decoded).any()
-
-
-def _read_image(path: Path, partial: PartialScan, frame: str | None, faults: Faults) -> ndarray | None:
-    try:
-        return read_image(path)
-    except FileError as error:
-        faults.add(error, relative(path, partial.root), frame)
-        return None
+            files.add(problem, "sl_color_path")
 
 
 def _nothing_in_it(what: str) -> Problem:
@@ -398,24 +369,16 @@ def _digest(image: ndarray, coords: Float32[ndarray, "h w 2"]) -> bytes:
 
 def _correspondences(
     frame: PartialFrame,
-    partial: PartialScan,
+    projector: Device | None,
     coords: Float32[ndarray, "h w 2"] | None,
     where: Bool[ndarray, "h w"] | None,
 ) -> Correspondences | None:
-    if coords is None or where is None or not where.any() or partial.projector is None:
+    if coords is None or where is None or not where.any() or projector is None:
         return None
     if frame.camera is None or frame.T_world_camera is None or frame.T_world_projector is None:
         return None
-    uv_camera, uv_projector = sample_pixels(coords, where)
-    return Correspondences(
-        frame.name,
-        frame.camera,
-        frame.T_world_camera,
-        frame.T_world_projector,
-        uv_camera,
-        uv_projector,
-        frame.pose_sigma,
-    )
+    poses, pixels = (frame.T_world_camera, frame.T_world_projector), sample_pixels(coords, where)
+    return Correspondences(frame.name, frame.camera, *poses, *pixels, frame.pose_sigma)
 
 
 @dataclass(frozen=True)
@@ -447,10 +410,9 @@ def check_folder(root: Path) -> FolderCheck:
     scan = None if found else partial.complete()
     if scan is not None:
         bar = scan.scale.bar
-        found = _faults_raised(lambda: bar and measured_length(scan, bar, scan.poses)) + [
-            replace(fault, file=f"{GROUND_TRUTH}/{fault.file}")
-            for fault in _faults_raised(lambda: read_ground_truth(scan))
-        ]
+        found = _faults_raised(lambda: bar and measured_length(scan, bar, scan.poses))
+        truth = _faults_raised(lambda: read_ground_truth(scan))
+        found += [replace(fault, file=f"{GROUND_TRUTH}/{fault.file}") for fault in truth]
     if scan is None or found:
         return FolderCheck(tuple(found), None, None, tuple(contents))
     usable = [c.correspondences for c in contents if c.correspondences is not None]
@@ -468,7 +430,7 @@ def _contents(
         pairs = zip(group, own, strict=True)
         yield from results([bound(check_content, frame, partial, pattern, good, f) for frame, f in pairs])
         for some in own:
-            faults.take(some)
+            faults.take(some.found)
 
 
 def check_scan(root: Path | str) -> list[Fault]:
@@ -499,10 +461,9 @@ def _check_images(
 ) -> None:
     """Do the coordinates of each frame belong to its images? Not asked where another fault was found in them."""
     by_name = {frame.name: frame for frame in frames}
-    matched = [MatchedFrame(content.name, content.match) for content in contents]
-    found = dict(image_problems(matched, lambda name: read_shown(by_name[name], good)))
-    captured = [MatchedFrame(content.name, content.image_match) for content in contents]
-    found = {**dict(image_problems(captured, lambda _: None)), **found}
+    shown = image_problems({c.name: c.match for c in contents}, lambda name: read_shown(by_name[name], good))
+    captured = image_problems({c.name: c.image_match for c in contents}, lambda _: None)
+    found = {**dict(captured), **dict(shown)}
     explained = {fault.frame for fault in faults.found if fault.field == "sl_coords_path"}
     for content in contents:
         if content.name in found and not {content.name, None} & explained:

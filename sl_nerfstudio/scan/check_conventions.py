@@ -37,17 +37,30 @@ class Interpretation:
     mirrored_x: bool = False
     mirrored_y: bool = False
 
+    @property
+    def key(self) -> str:
+        """The key of transforms.json that the mistake concerns."""
+        if self in OTHER_AXES:
+            return "sl_coords_path"
+        return "projector_transform_matrix" if self.camera == "as given" else "transform_matrix"
+
+
+OTHER_AXES = tuple(
+    Interpretation(swapped=swapped, mirrored_x=x, mirrored_y=y)
+    for swapped, x, y in product((False, True), repeat=3)
+    if swapped or x or y
+)
+"""Every exchange and reversal of the axes of coordinates."""
+
 
 def other_interpretations() -> Iterator[Interpretation]:
     """Every known mistake, the more common ones first."""
     for both in POSE_CONVENTIONS[1:]:
         yield Interpretation(camera=both, projector=both)
-    for camera, projector in product(POSE_CONVENTIONS, POSE_CONVENTIONS):
+    for camera, projector in product(POSE_CONVENTIONS, repeat=2):
         if camera != projector:
             yield Interpretation(camera=camera, projector=projector)
-    for swapped, x, y in product((False, True), (False, True), (False, True)):
-        if swapped or x or y:
-            yield Interpretation(swapped=swapped, mirrored_x=x, mirrored_y=y)
+    yield from OTHER_AXES
     yield Interpretation(projector_unit=1e3)
     yield Interpretation(projector_unit=1e-3)
 
@@ -91,20 +104,13 @@ _REMEDIES = {
 }
 
 
-def key_of(interpretation: Interpretation) -> str:
-    """The key of transforms.json that a mistake concerns."""
-    if interpretation.swapped or interpretation.mirrored_x or interpretation.mirrored_y:
-        return "sl_coords_path"
-    return "projector_transform_matrix" if interpretation.camera == "as given" else "transform_matrix"
-
-
 def describe(interpretation: Interpretation, given: GeometricFit, index: int | None = None) -> Problem:
     """The mistake that `interpretation` undoes, in all frames or in frame `index`; `given` is the fit before."""
     residual = given.typical_px if index is None else float(given.residual_px[index])
     spread = given.typical_spread if index is None else float(given.spread[index])
     which = "all frames" if index is None else "this frame"
     symptom = _symptom(residual, spread)
-    if interpretation.swapped or interpretation.mirrored_x or interpretation.mirrored_y:
+    if interpretation in OTHER_AXES:
         return describe_coords(interpretation, f"do not fit the poses in {which}: {symptom}")
     problem = f"does not fit the coordinates in {which}: {symptom}"
     if interpretation.projector_unit != 1:
@@ -114,12 +120,10 @@ def describe(interpretation: Interpretation, given: GeometricFit, index: int | N
             f"{interpretation.projector_unit:g} it fits",
             "give all positions in the scan's unit",
         )
-    whose: list[tuple[str, PoseConvention]]
+    whose = {"the camera matrices": interpretation.camera, "the projector matrices": interpretation.projector}
     if interpretation.camera == interpretation.projector:
-        whose = [("camera and projector matrices", interpretation.camera)]
-    else:
-        whose = [("the camera matrices", interpretation.camera), ("the projector matrices", interpretation.projector)]
-    wrong = [(who, how) for who, how in whose if how != "as given"]
+        whose = {"camera and projector matrices": interpretation.camera}
+    wrong = [(who, how) for who, how in whose.items() if how != "as given"]
     cause = " and ".join(f"{who} {_CAUSES[how]}" for who, how in wrong)
     remedy = "; ".join(f"{who}: {_REMEDIES[how]}" for who, how in wrong)
     return Problem(
@@ -135,18 +139,16 @@ def _symptom(residual: float, spread: float) -> str:
     return f"camera rays and projector rays miss each other by {residual:.0f} px"
 
 
+_AXES = {  # what was done, and what undoes it
+    "swapped": ("x and y swapped", "swap the two channels"),
+    "mirrored_x": ("x counted from the right", "x := projector w - x"),
+    "mirrored_y": ("y counted from below", "y := projector h - y"),
+}
+
+
 def describe_coords(interpretation: Interpretation, problem: str) -> Problem:
     """Coordinates with exchanged or mirrored axes; `problem` says how it shows."""
-    done = [
-        *(["x and y swapped"] if interpretation.swapped else []),
-        *(["x counted from the right"] if interpretation.mirrored_x else []),
-        *(["y counted from below"] if interpretation.mirrored_y else []),
-    ]
-    undo = [
-        *(["swap the two channels"] if interpretation.swapped else []),
-        *(["x := projector w - x"] if interpretation.mirrored_x else []),
-        *(["y := projector h - y"] if interpretation.mirrored_y else []),
-    ]
+    done, undo = zip(*(words for name, words in _AXES.items() if getattr(interpretation, name)), strict=True)
     return Problem(
         problem,
         f"the coordinates have {' and '.join(done)}: interpreted that way they fit",
@@ -188,17 +190,13 @@ def convention_problems(
     """
     given = fit_geometry(frames, projector)
     focal = (projector.fl_x + projector.fl_y) / 2
-    copied = copied_poses(frames, given, focal)
-    if copied is not None:
-        yield None, *copied
-        return
-    interpretation = _better_interpretation(frames, projector, given, focal)
-    if interpretation is not None:
-        yield None, key_of(interpretation), describe(interpretation, given)
-        return
-    mixed = mixed_poses(frames, projector, given)
-    if mixed is not None:
-        yield None, *mixed
+    found = copied_poses(frames, given, focal)
+    if found is None:
+        interpretation = _better_interpretation(frames, projector, given, focal)
+        found = interpretation and (interpretation.key, describe(interpretation, given))
+    found = found or mixed_poses(frames, projector, given)
+    if found is not None:
+        yield None, *found
         return
     lost = given.residual_px > _HOPELESS * focal
     if lost.mean() >= _MOST:
@@ -211,28 +209,22 @@ def convention_problems(
             own = _better_interpretation_of_frame(frames, index, projector, given, others, focal)
             if own is not None:
                 explained.add(index)
-                yield frame.name, key_of(own), describe(own, given, index)
+                yield frame.name, own.key, describe(own, given, index)
     for index, key, times in _far_devices(frames):
         if index not in explained:
-            yield (
-                frames[index].name,
-                key,
-                Problem(
-                    f"puts the device {times:.2g} times as far from the other devices as is usual in this scan",
-                    "registration failed for this frame, or its position is in another unit",
-                    "register it again, or leave the frame out",
-                ),
+            problem = Problem(
+                f"puts the device {times:.2g} times as far from the other devices as is usual in this scan",
+                "registration failed for this frame, or its position is in another unit",
+                "register it again, or leave the frame out",
             )
+            yield frames[index].name, key, problem
     if metres is not None and not _NEAREST <= given.depth * metres <= _FARTHEST:
-        yield (
-            None,
-            "units",
-            Problem(
-                f"would put the object {given.depth * metres:.3g} m from the camera",
-                "lengths are in another unit than stated (m and mm mixed up?)",
-                'state the unit that the poses are in, or "arbitrary" if it is unknown',
-            ),
+        problem = Problem(
+            f"would put the object {given.depth * metres:.3g} m from the camera",
+            "lengths are in another unit than stated (m and mm mixed up?)",
+            'state the unit that the poses are in, or "arbitrary" if it is unknown',
         )
+        yield None, "units", problem
 
 
 def _better_interpretation(
@@ -265,10 +257,10 @@ def _better_interpretation_of_frame(
     found: list[tuple[float, Interpretation]] = []
     for interpretation in other_interpretations():
         alone = fit_geometry([apply_interpretation(interpretation, frames[index], projector)], projector)
-        px, cloud = alone.typical_px, alone.clouds[0]
+        px = alone.typical_px
         if px > _FITS * focal:
             continue
-        apart = others.distance(cloud, index) / given.depth
+        apart = others.distance(alone.clouds[0], index) / given.depth
         if apart < APART and _explains(residual, spread, px, apart, focal):
             found.append((_badness(px, apart, focal), interpretation))
     return min(found, key=lambda item: item[0])[1] if found else None

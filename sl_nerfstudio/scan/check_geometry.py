@@ -105,15 +105,10 @@ class GeometricFit:
         return float(np.median(self.spread))
 
     @property
-    def excess(self) -> Float64[ndarray, "n"]:
-        """The frames' residuals in units of what is stated; NaN where nothing is."""
-        return self.residual_px / self.stated_px
-
-    @property
     def typical_excess(self) -> float:
-        """Median of `excess` over the frames for which something is stated; NaN without any."""
-        stated = self.excess[np.isfinite(self.stated_px)]
-        return float(np.median(stated)) if len(stated) else np.nan
+        """Median of the residuals in units of what is stated, of frames for which something is; NaN without any."""
+        excess = (self.residual_px / self.stated_px)[np.isfinite(self.stated_px)]
+        return float(np.median(excess)) if len(excess) else np.nan
 
 
 def fit_geometry(frames: Sequence[Correspondences], projector: Device) -> GeometricFit:

@@ -1,15 +1,14 @@
 """Do coordinates belong to the pattern and to the image? Shifted ones, those of another frame, or of no image."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from scipy.ndimage import uniform_filter
 
-from sl_nerfstudio.scan.check_conventions import Interpretation, converted_coords, describe_coords
+from sl_nerfstudio.scan.check_conventions import OTHER_AXES, Interpretation, converted_coords, describe_coords
 from sl_nerfstudio.scan.document import Problem
 
 # Are coordinates shifted relative to the pattern, for example because pixels are counted from their centres?
@@ -61,12 +60,13 @@ def shift_problems(shifts: Sequence[Float64[ndarray, "2"] | None]) -> Iterator[P
     half = sign * _HALF
     same = np.abs(np.array(known) - half).max(1) < _TOLERANCE_FRAME
     if np.abs(middle - half).max() < _TOLERANCE and same.mean() >= _MOST:
+        cause, remedy = "half a pixel was added although it was already there", "subtract 0.5 from"
+        if sign > 0:
+            cause, remedy = "pixel centres are at whole numbers (OpenCV) instead of at .5", "add 0.5 to"
         yield Problem(
             f"are shifted relative to the pattern by half a pixel in x and y, in {same.sum()} of {len(known)} frames",
-            "pixel centres are at whole numbers (OpenCV) instead of at .5"
-            if sign > 0
-            else "half a pixel was added although it was already there",
-            f"{'add 0.5 to' if sign > 0 else 'subtract 0.5 from'} both coordinates everywhere",
+            cause,
+            f"{remedy} both coordinates everywhere",
         )
 
 
@@ -96,11 +96,7 @@ def look_up(pattern: Float32[ndarray, "rows columns"], uv: Float32[ndarray, "n 2
 
 _FEWEST_COMPARED = 200
 _KEPT = 1000  # pixels that are compared with the images of other frames
-_OTHER_AXES = tuple(
-    Interpretation(swapped=swapped, mirrored_x=x, mirrored_y=y)
-    for swapped, x, y in product((False, True), (False, True), (False, True))
-    if swapped or x or y
-)
+
 _DETAILS = 10  # of a pattern's width: what is larger is no detail
 _WINDOW = 256  # side of the square, around the middle of the decoded pixels, in which a move is looked for
 
@@ -175,14 +171,14 @@ def match_image(
     uv = coords[rows, columns]
     found = [
         ImagePrediction(rows, columns, look_up(pattern, converted_coords(uv, how, size))).correlation(shown, allowed)
-        for how in _OTHER_AXES
+        for how in OTHER_AXES
     ]
     return ImageMatch(
         correlation=prediction.correlation(shown, allowed),
         moved=prediction.correlation(shown, allowed, x, y),
         x=x,
         y=y,
-        other_axes=_OTHER_AXES[int(np.argmax(found))],
+        other_axes=OTHER_AXES[int(np.argmax(found))],
         interpreted=max(found),
         prediction=prediction.thinned(_KEPT),
     )
@@ -221,27 +217,22 @@ _AXES_GAIN = 0.1  # by which they fit with exchanged or mirrored axes: grids loo
 _BETTER = 0.75  # quantile of the frames to which the others are compared
 
 
-@dataclass(frozen=True)
-class MatchedFrame:
-    """A frame and how well its image fits its coordinates; None if it could not be compared."""
-
-    name: str
-    match: ImageMatch | None
-
-
 Shown = tuple[Float32[ndarray, "h w"], Bool[ndarray, "h w"]]
 """An image, and where it shows the object."""
 
 
 def image_problems(
-    frames: Sequence[MatchedFrame], read_shown: Callable[[str], Shown | None]
+    matches: Mapping[str, ImageMatch | None], read_shown: Callable[[str], Shown | None]
 ) -> Iterator[tuple[str, Problem]]:
-    """(frame, problem) of coordinates that do not belong to the image; `read_shown` gives the image of a frame."""
-    known = [(frame.name, frame.match) for frame in frames if frame.match is not None]
-    usual = float(np.quantile([match.correlation for _, match in known], _BETTER)) if known else 0.0
-    strange = {name: match for name, match in known if match.correlation < max(_NOTHING * usual, CLEAR / 2)}
-    others = _fitting_others(strange, [frame.name for frame in frames], read_shown)
-    for name, match in known:
+    """(frame, problem) of coordinates that do not belong to the image; `read_shown` gives the image of a frame.
+
+    `matches` says by the frame's name how well its image fits; None if it could not be compared.
+    """
+    known = {name: match for name, match in matches.items() if match is not None}
+    usual = float(np.quantile([match.correlation for match in known.values()], _BETTER)) if known else 0.0
+    strange = {name: match for name, match in known.items() if match.correlation < max(_NOTHING * usual, CLEAR / 2)}
+    others = _fitting_others(strange, matches, read_shown)
+    for name, match in known.items():
         other = others.get(name, ("", 0.0))
         if _is_shifted(match, usual) and match.moved > other[1]:
             yield name, _shifted(match)
@@ -260,7 +251,7 @@ def _is_shifted(match: ImageMatch, usual: float) -> bool:
 
 
 def _fitting_others(
-    strange: dict[str, ImageMatch], names: Sequence[str], read_shown: Callable[[str], Shown | None]
+    strange: dict[str, ImageMatch], names: Iterable[str], read_shown: Callable[[str], Shown | None]
 ) -> dict[str, tuple[str, float]]:
     """Find for each frame another one whose image its coordinates fit, with the correlation; read each image once."""
     found: dict[str, tuple[str, float]] = {}

@@ -43,17 +43,16 @@ Kind = Literal["camera", "projector"]
 _KEYS: dict[Kind, str] = {"camera": "transform_matrix", "projector": "projector_transform_matrix"}
 
 
+def _stacked(frames: Sequence[Correspondences], kind: Kind) -> Float64[ndarray, "n 4 4"]:
+    """The poses of one kind of device."""
+    return np.stack([getattr(frame, f"T_world_{kind}") for frame in frames])
+
+
 def is_suspect(fit: GeometricFit, focal: float) -> bool:
     """Whether the rays of most frames miss each other by more than is stated, or else usual."""
     if np.isfinite(fit.typical_excess):
         return fit.typical_excess > SUSPECT_SIGMAS
     return fit.typical_px > SUSPECT * focal
-
-
-def suspect_frames(fit: GeometricFit, focal: float) -> ndarray:
-    """Find frames whose rays miss each other by more than is stated for them, or else usual."""
-    stated = np.where(np.isnan(fit.stated_px), SUSPECT * focal, SUSPECT_SIGMAS * fit.stated_px)
-    return fit.residual_px > stated
 
 
 # One pose in all frames.
@@ -64,33 +63,29 @@ def copied_poses(frames: Sequence[Correspondences], given: GeometricFit, focal: 
 
     A device that stands still has one pose as well: then it fits.
     """
-    bad = suspect_frames(given, focal)
+    stated = np.where(np.isnan(given.stated_px), SUSPECT * focal, SUSPECT_SIGMAS * given.stated_px)
+    bad = given.residual_px > stated  # their rays miss each other by more than is stated for them, or else usual
     if len(frames) < 3 or bad.mean() < 0.5 or bad.all():  # it fits the frame that it was copied from
         return None
-    T = DevicePoses(np.stack([f.T_world_camera for f in frames]), np.stack([f.T_world_projector for f in frames]))
+    T = DevicePoses(_stacked(frames, "camera"), _stacked(frames, "projector"))
     length = max(float(np.median(T.baseline)), 1e-300)
     camera, projector = _same(T.T_world_camera, length), _same(T.T_world_projector, length)
     relative = _same(T.T_camera_projector, length)
-    fits = f"it fits the coordinates of {int((~bad).sum())} of {len(frames)} frames"
-    both: tuple[tuple[Kind, ndarray], ...] = (("camera", camera), ("projector", projector))
-    for kind, mine in both:
-        if len(mine) > len(frames) / 2:
-            first, others = frames[mine[0]].name, len(mine) - 1
+    found: tuple[tuple[Kind, ndarray], ...] = (("camera", camera), ("projector", projector), ("projector", relative))
+    for kind, same in found:
+        if len(same) > len(frames) / 2:
+            what, first, others = "is the same", frames[same[0]].name, len(same) - 1
+            cause = f"moved between the frames, and the pose of {first} was copied to {others} others"
+            if same is relative:
+                what = "lies in the same place relative to the camera"
+                cause = "moved against the camera between the frames, and one calibration of the two was copied"
             return _KEYS[kind], Problem(
-                f"is the same in {len(mine)} of {len(frames)} frames, and {fits}; rays miss each other by "
-                f"{given.typical_px:.0f} px",
-                f"the {kind} moved between the frames, and the pose of {first} was copied to {others} others",
+                f"{what} in {len(same)} of {len(frames)} frames, and it fits the coordinates of {int((~bad).sum())} of "
+                f"{len(frames)} frames; rays miss each other by {given.typical_px:.0f} px",
+                f"the {kind} {cause}",
                 f"give each frame its own pose of the {kind}; where none is known, make the scan from the photographs: "
                 "sl-process finds both poses of every frame",
             )
-    if len(relative) > len(frames) / 2:
-        return _KEYS["projector"], Problem(
-            f"lies in the same place relative to the camera in {len(relative)} of {len(frames)} frames, and {fits}; "
-            f"rays miss each other by {given.typical_px:.0f} px",
-            "the projector moved against the camera between the frames, and one calibration of the two was copied",
-            "give each frame its own pose of the projector; where none is known, make the scan from the photographs: "
-            "sl-process finds both poses of every frame",
-        )
     return None
 
 
@@ -208,7 +203,7 @@ def _worlds(frames: Sequence[Correspondences], projector: Device) -> Iterator[_M
 
 def _moved(frames: Sequence[Correspondences], S: Similarity) -> list[Correspondences]:
     """The frames with all cameras moved."""
-    moved = S.poses(np.stack([frame.T_world_camera for frame in frames]))
+    moved = S.poses(_stacked(frames, "camera"))
     return [replace(frame, T_world_camera=T) for frame, T in zip(frames, moved, strict=True)]
 
 
@@ -218,9 +213,7 @@ def _rows(values: Float64[ndarray, "m n"]) -> str:
 
 def _starts(frames: Sequence[Correspondences]) -> Iterator[Similarity]:
     """Motions of the cameras that may bring them to their projectors: the two are near each other and look alike."""
-    camera, projector = (
-        np.stack([getattr(f, name) for f in frames]) for name in ("T_world_camera", "T_world_projector")
-    )
+    camera, projector = _stacked(frames, "camera"), _stacked(frames, "projector")
     yield from (Similarity(1.0, R, np.zeros(3)) for R in AXIS_TURNS)
     yield fit_similarity(camera[:, :3, 3], projector[:, :3, 3])
     U, _, Vt = np.linalg.svd((projector[:, :3, :3] @ camera[:, :3, :3].transpose(0, 2, 1)).sum(0))
@@ -255,8 +248,8 @@ class _Motions:
         return _Motions(
             Intrinsics.of([f.camera for f in some], torch.float64).reshape(-1, 1),
             Intrinsics.of(projector, torch.float64),
-            np.stack([f.T_world_camera for f in some]),
-            tensor(np.stack([f.T_world_projector for f in some]))[:, None],
+            _stacked(some, "camera"),
+            tensor(_stacked(some, "projector"))[:, None],
             tensor(np.stack([f.uv_camera[::step] for f in some])),
             tensor(np.stack([f.uv_projector[::step] for f in some])),
             _KERNEL * (projector.fl_x + projector.fl_y) / 2,
@@ -276,8 +269,9 @@ class _Motions:
 
     def best(self, start: Similarity) -> Similarity:
         """The nearest minimum."""
-        middle = start.points(self.T_world_camera[:, :3, 3]).mean(0)
-        size = max(float(np.linalg.norm(start.points(self.T_world_camera[:, :3, 3]) - middle, axis=1).max()), 1e-300)
+        centres = start.points(self.T_world_camera[:, :3, 3])
+        middle = centres.mean(0)
+        size = max(float(np.linalg.norm(centres - middle, axis=1).max()), 1e-300)
 
         def moved(S: Similarity, x: Float64[ndarray, "7"]) -> Similarity:
             R = exp_so3(torch.from_numpy(x[:3].copy())).numpy()

@@ -5,7 +5,7 @@ import math
 import os
 import stat
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path, PureWindowsPath
@@ -29,6 +29,10 @@ class FileError(UserError):
         """All in plain words; `problem` continues a sentence that starts with the file's name."""
         super().__init__(f"{path}: {problem}\n    cause:  {cause}\n    remedy: {remedy}")
         self.path, self.problem, self.cause, self.remedy = path, problem, cause, remedy
+
+    def with_more(self, words: str) -> "FileError":
+        """The same error, whose problem goes on with some words."""
+        return FileError(self.path, self.problem + words, self.cause, self.remedy)
 
 
 def check_file(path: Path) -> int:
@@ -101,17 +105,14 @@ class Faults:
 
     def add(self, problem: Problem | FileError, file: str, frame: str | None = None, key: str | None = None) -> None:
         """Add a problem, once. `file` is relative to the folder; `key` is a field in it."""
-        self._add(Fault(file, frame, key, problem.problem, problem.cause, problem.remedy))
+        self.take([Fault(file, frame, key, problem.problem, problem.cause, problem.remedy)])
 
-    def take(self, others: "Faults") -> None:
-        """Add those of another collection, once."""
-        for fault in others.found:
-            self._add(fault)
-
-    def _add(self, fault: Fault) -> None:
-        if fault not in self._known:
-            self._known.add(fault)
-            self.found.append(fault)
+    def take(self, faults: Iterable[Fault]) -> None:
+        """Add faults, each once."""
+        for fault in faults:
+            if fault not in self._known:
+                self._known.add(fault)
+                self.found.append(fault)
 
 
 # transforms.json as text: strict JSON, UTF-8, every key once, every number finite.
@@ -119,7 +120,7 @@ class Faults:
 TRANSFORMS = "transforms.json"
 MAX_BYTES = 256 << 20
 MAX_DEPTH = 32  # of lists and objects in each other; a scan has 6, and what walks a document may recurse this far
-_TOO_DEEP = Problem("is nested too deeply", "it does not describe a scan", "write the file again")
+
 _BOM = b"\xef\xbb\xbf"
 
 
@@ -154,13 +155,13 @@ def read_document(path: Path) -> Record:
             "save it as UTF-8",
         ) from error
     except RecursionError as error:
-        raise FileError(path, _TOO_DEEP.problem, _TOO_DEEP.cause, _TOO_DEEP.remedy) from error
+        raise _too_deep(path) from error
     except json.JSONDecodeError as error:
         raise _syntax_error(path, content, error) from error
     except ValueError as error:  # a number with thousands of digits
         raise FileError(path, f"is not valid JSON ({error})", "a damaged number", "write the file again") from error
     if _deeper_than(document, MAX_DEPTH):
-        raise FileError(path, _TOO_DEEP.problem, _TOO_DEEP.cause, _TOO_DEEP.remedy)
+        raise _too_deep(path)
     if not isinstance(document, Record):
         raise FileError(
             path,
@@ -192,6 +193,10 @@ def _record(pairs: list[tuple[str, Any]]) -> Record:
     return record
 
 
+def _too_deep(path: Path) -> FileError:
+    return FileError(path, "is nested too deeply", "it does not describe a scan", "write the file again")
+
+
 def _deeper_than(document: Any, limit: int) -> bool:
     """Whether lists and objects are nested more than `limit` times; level by level, without recursion."""
     level = [document]
@@ -217,12 +222,8 @@ def _syntax_error(path: Path, content: bytes, error: json.JSONDecodeError) -> Fi
 
 def _walk(value: Any, frame: str | None, key: str) -> Iterator[tuple[str | None, str, Problem]]:
     if isinstance(value, Record):
-        for twice in value.duplicates:
-            yield (
-                frame,
-                f"{key}.{twice}".lstrip("."),
-                Problem("occurs more than once", "a mistake when files were edited or merged", "keep the right one"),
-            )
+        twice = Problem("occurs more than once", "a mistake when files were edited or merged", "keep the right one")
+        yield from ((frame, f"{key}.{name}".lstrip("."), twice) for name in value.duplicates)
         for name, item in value.items():
             if not key and frame is None and name == "frames" and isinstance(item, list):
                 for index, record in enumerate(item):
@@ -288,15 +289,8 @@ class Fields:
         if key not in self.record and default is not None:
             return default
         value = self._get(key)
-        if value is None:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return self._wrong_type(key, value, "a number")
-        try:
-            number = float(value)
-        except OverflowError:
-            return self._wrong_type(key, value, "a number of reasonable size")
-        return number if math.isfinite(number) else None
+        found = None if value is None else self._finite(key, value, [value], "a number")
+        return None if found is None else float(found[0])
 
     def read_count(self, key: str) -> int | None:
         """A whole number greater than 0."""
@@ -349,34 +343,34 @@ class Fields:
 
     def read_numbers(self, key: str, count: int) -> list[float] | None:
         """A list of `count` finite numbers."""
-        value = self._get(key)
+        value, wanted = self._get(key), f"a list of {count} numbers"
         if value is None:
             return None
-        numbers = value if isinstance(value, list) else []
-        right = len(numbers) == count and all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers)
-        if not right:
-            return self._wrong_type(key, value, f"a list of {count} numbers")
-        try:
-            found = [float(x) for x in numbers]
-        except OverflowError:
-            return self._wrong_type(key, value, f"a list of {count} numbers of reasonable size")
-        return found if all(map(math.isfinite, found)) else None
+        if not isinstance(value, list) or len(value) != count:
+            return self._wrong_type(key, value, wanted)
+        found = self._finite(key, value, value, wanted)
+        return None if found is None else found.tolist()
 
     def read_matrix(self, key: str) -> Float64[ndarray, "rows columns"] | None:
         """A list of rows of finite numbers."""
-        value = self._get(key)
+        value, wanted = self._get(key), "a list of four rows of four numbers"
         if value is None:
             return None
         rows = value if isinstance(value, list) else []
-        numbers = [x for row in rows if isinstance(row, list) for x in row]
-        regular = rows and all(isinstance(row, list) and len(row) == len(rows[0]) > 0 for row in rows)
-        if not regular or not all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers):
-            return self._wrong_type(key, value, "a list of four rows of four numbers")
+        if not rows or not all(isinstance(row, list) and len(row) == len(rows[0]) > 0 for row in rows):
+            return self._wrong_type(key, value, wanted)
+        found = self._finite(key, value, [x for row in rows for x in row], wanted)
+        return None if found is None else found.reshape(len(rows), -1)
+
+    def _finite(self, key: str, value: Any, numbers: list[Any], wanted: str) -> Float64[ndarray, "n"] | None:
+        """The numbers in a value; None after adding a fault where it holds something else, or one is not finite."""
+        if not all(isinstance(x, int | float) and not isinstance(x, bool) for x in numbers):
+            return self._wrong_type(key, value, wanted)
         try:
-            matrix = np.array(rows, dtype=np.float64)
+            found = np.array(numbers, dtype=np.float64)
         except OverflowError:
-            return self._wrong_type(key, value, "a list of four rows of four numbers of reasonable size")
-        return matrix if np.isfinite(matrix).all() else None
+            return self._wrong_type(key, value, f"{wanted} of reasonable size")
+        return found if np.isfinite(found).all() else None
 
     def check_spelling(self, known: Sequence[str]) -> None:
         """Add a fault for each key that looks like a misspelt one of `known` that is absent."""

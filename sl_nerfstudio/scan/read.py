@@ -2,6 +2,8 @@
 
 import os
 import shlex
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -62,13 +64,14 @@ def pose_problem(T: Float64[ndarray, "..."]) -> Problem | None:
         )
     if np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-9:
         return _last_row_problem(T)
-    reach = float(np.abs(T[:3, 3]).max())
-    far = Problem(
-        f"puts the device {reach:.2g} units from the origin",
-        "registration or calibration diverged for this frame, or the number was damaged",
-        "calibrate it again or leave the frame out",
-    )
-    return _rotation_problem(T[:3, :3]) or (far if reach > FARTHEST else None)
+    problem, reach = _rotation_problem(T[:3, :3]), float(np.abs(T[:3, 3]).max())
+    if problem is None and reach > FARTHEST:
+        return Problem(
+            f"puts the device {reach:.2g} units from the origin",
+            "registration or calibration diverged for this frame, or the number was damaged",
+            "calibrate it again or leave the frame out",
+        )
+    return problem
 
 
 def _last_row_problem(T: Float64[ndarray, "4 4"]) -> Problem:
@@ -135,18 +138,9 @@ class PartialFrame:
         """The frame, if no fault was found. Raises ValueError if a value is missing."""
         if self.camera is None or self.T_world_camera is None or self.T_world_projector is None:
             raise ValueError(f"frame {self.name} has faults")
-        return Frame(
-            name=self.name,
-            camera=self.camera,
-            image_path=self.paths["file_path"],
-            pattern_path=self.paths.get("sl_pattern_path"),
-            coords_path=self.paths.get("sl_coords_path"),
-            mask_path=self.paths.get("mask_path"),
-            T_world_camera=self.T_world_camera,
-            T_world_projector=self.T_world_projector,
-            pose_sigma=self.pose_sigma,
-            color_path=self.paths.get("sl_color_path"),
-        )
+        image, poses = self.paths["file_path"], (self.T_world_camera, self.T_world_projector)
+        pattern, coords, mask, color = map(self.paths.get, FRAME_FILES[1:])
+        return Frame(self.name, self.camera, image, pattern, coords, mask, *poses, self.pose_sigma, color)
 
 
 def read_frame(frame: Fields, top: Fields, root: Path, common: Device | None, need_coords: bool) -> PartialFrame:
@@ -155,13 +149,20 @@ def read_frame(frame: Fields, top: Fields, root: Path, common: Device | None, ne
     frame.check_spelling(_FRAME_KEYS)
     result.camera = read_frame_camera(frame, top) if any(key in frame.record for key in CAMERA_KEYS) else common
     for key in FRAME_FILES:
-        if key == "file_path" or (key == "sl_coords_path" and need_coords) or frame.record.get(key) is not None:
+        needed = key == "file_path" or (key == "sl_coords_path" and need_coords)
+        if needed or frame.record.get(key) is not None:
             path = read_path(frame, key, root)
             if path is not None:
                 result.paths[key] = path
     result.T_world_camera, result.T_world_projector = (read_pose(frame, key) for key in POSES)
-    if result.T_world_camera is not None and result.T_world_projector is not None:
-        _check_baseline(frame, result.T_world_camera, result.T_world_projector)
+    poses = result.T_world_camera, result.T_world_projector
+    if poses[0] is not None and poses[1] is not None and np.array_equal(poses[0][:3, 3], poses[1][:3, 3]):
+        frame.fault(
+            "projector_transform_matrix",
+            "has exactly the position of the camera",
+            "the camera's pose was copied, or the calibration is missing",
+            "calibrate the projector relative to the camera; without a distance between them there is no depth",
+        )
     return result
 
 
@@ -194,18 +195,6 @@ def read_pose(frame: Fields, key: str) -> Float64[ndarray, "4 4"] | None:
     return None
 
 
-def _check_baseline(
-    frame: Fields, T_world_camera: Float64[ndarray, "4 4"], T_world_projector: Float64[ndarray, "4 4"]
-) -> None:
-    if np.array_equal(T_world_camera[:3, 3], T_world_projector[:3, 3]):
-        frame.fault(
-            "projector_transform_matrix",
-            "has exactly the position of the camera",
-            "the camera's pose was copied, or the calibration is missing",
-            "calibrate the projector relative to the camera; without a distance between them there is no depth",
-        )
-
-
 def read_sigma(fields: Fields) -> PoseSigma | None:
     """The value of `sl_pose_sigma`; None where it is absent, or after adding a fault."""
     if fields.record.get("sl_pose_sigma") is None:
@@ -216,17 +205,12 @@ def read_sigma(fields: Fields) -> PoseSigma | None:
     section.check_spelling(SIGMA_KEYS)
     values = {key: section.read_number(key) for key in SIGMA_KEYS}
     for key, value in values.items():
-        if value is not None and value > FARTHEST:
-            section.fault(
-                key, f"is {value:g}", "the adjustment diverged, or the number was damaged",
-                "give the uncertainty of the starting poses, or leave sl_pose_sigma out",
-            )  # fmt: skip
-            return None
-        if value is not None and value <= 0:
-            section.fault(
-                key, f"is {value:g}", "a standard deviation must be greater than 0",
-                "give the uncertainty of the starting poses, however small, or leave sl_pose_sigma out",
-            )  # fmt: skip
+        if value is not None and not 0 < value <= FARTHEST:
+            cause, size = "a standard deviation must be greater than 0", ", however small"
+            if value > 0:
+                cause, size = "the adjustment diverged, or the number was damaged", ""
+            remedy = f"give the uncertainty of the starting poses{size}, or leave sl_pose_sigma out"
+            section.fault(key, f"is {value:g}", cause, remedy)
             return None
     numbers = {key: value for key, value in values.items() if value is not None}
     return PoseSigma(**numbers) if len(numbers) == len(SIGMA_KEYS) else None
@@ -234,31 +218,25 @@ def read_sigma(fields: Fields) -> PoseSigma | None:
 
 def check_together(frames: list[PartialFrame], faults: Faults) -> None:
     """Add the faults that show only when several frames are compared: equal names, or equal poses in all frames."""
-    seen: set[str] = set()
-    for frame in frames:
-        if frame.name in seen:
-            problem = Problem(
-                "occurs more than once",
-                "a frame was duplicated, or images in two folders have the same name",
-                "remove the duplicate, or rename one of the images",
-            )
-            faults.add(problem, TRANSFORMS, frame.name, "file_path")
-        seen.add(frame.name)
-    posed = [f for f in frames if f.T_world_camera is not None and f.T_world_projector is not None]
-    if len(posed) < 2 or len(posed) != len(frames):
-        return
-    if all(_same_poses(frame, posed[0]) for frame in posed[1:]):
+    twice = Problem(
+        "occurs more than once",
+        "a frame was duplicated, or images in two folders have the same name",
+        "remove the duplicate, or rename one of the images",
+    )
+    for name, count in Counter(frame.name for frame in frames).items():
+        if count > 1:
+            faults.add(twice, TRANSFORMS, name, "file_path")
+    pairs = ((f.T_world_camera, f.T_world_projector) for f in frames)
+    posed = [
+        np.stack([camera, projector]) for camera, projector in pairs if camera is not None and projector is not None
+    ]
+    if len(posed) == len(frames) > 1 and all(np.array_equal(T, posed[0]) for T in posed):
         problem = Problem(
             "is the same in all frames, for camera and projector",
             "the poses were never filled in, or nothing was moved",
             "register the frames first; a scan needs views from different places",
         )
         faults.add(problem, TRANSFORMS, None, "transform_matrix")
-
-
-def _same_poses(a: PartialFrame, b: PartialFrame) -> bool:
-    pairs = ((a.T_world_camera, b.T_world_camera), (a.T_world_projector, b.T_world_projector))
-    return all(x is not None and y is not None and np.array_equal(x, y) for x, y in pairs)
 
 
 # transforms.json as a whole: what could be read of a scan, and everything that could not.
@@ -288,10 +266,8 @@ class PartialScan:
         """The scan, if no fault was found. Raises ValueError if a value is missing."""
         if self.units is None or self.scale is None or self.projector is None or self.pattern_path is None:
             raise ValueError("a scan with faults cannot be completed")
-        frames = tuple(frame.complete() for frame in self.frames)
-        return Scan(
-            self.root, self.units, self.scale, self.projector, self.pattern_path, frames, shrunk_by=self.shrunk_by
-        )
+        frames, shrunk_by = tuple(frame.complete() for frame in self.frames), self.shrunk_by
+        return Scan(self.root, self.units, self.scale, self.projector, self.pattern_path, frames, shrunk_by=shrunk_by)
 
 
 def read_partial_scan(root: Path, faults: Faults, need_coords: bool = True) -> PartialScan:
@@ -310,9 +286,8 @@ def read_partial_scan(root: Path, faults: Faults, need_coords: bool = True) -> P
     top.check_spelling(_TOP_KEYS)
     number = top.read_number("sl_format")
     if number is not None and number != FORMAT:
-        top.fault(
-            "sl_format", f"is {number:g}", "it was written by a newer version of this package", "update the package"
-        )
+        cause = "it was written by a newer version of this package"
+        top.fault("sl_format", f"is {number:g}", cause, "update the package")
     partial.units = top.read_choice("units", list(UNITS), "an unknown unit of length")
     if "sl_shrunk_by" in document:
         partial.shrunk_by = top.read_count("sl_shrunk_by") or 1
@@ -323,7 +298,8 @@ def read_partial_scan(root: Path, faults: Faults, need_coords: bool = True) -> P
         partial.pattern_path = read_path(section, "pattern_path", root)
     common_sigma = read_sigma(top)
     records = _frame_records(top)
-    common = _read_common_camera(top, records)
+    all_own = all(isinstance(record, dict) and any(key in record for key in CAMERA_KEYS) for record in records)
+    common = None if records and all_own else read_device(top, "camera")
     for index, record in enumerate(records):
         if isinstance(record, dict):
             frame = Fields(record, faults, TRANSFORMS, frame_label(record, index))
@@ -431,27 +407,24 @@ def _frame_records(top: Fields) -> list[Any]:
     return frames
 
 
-def _read_common_camera(top: Fields, records: list[Any]) -> Device | None:
-    """The camera of all frames; None (without a fault) if every frame has its own."""
-    own = [isinstance(r, dict) and any(key in r for key in CAMERA_KEYS) for r in records]
-    if own and all(own):
-        return None
-    return read_device(top, "camera")
-
-
 # The headers of a scan's files: do the files exist, are they of the right kind and size? Decodes nothing.
 
+_CHECKED = ("file_path", "sl_pattern_path", "mask_path", "sl_color_path", "sl_coords_path")
 _MAY_BE_COLOUR = ("file_path", "sl_color_path")
 
 
 def check_headers(partial: PartialScan, faults: Faults) -> set[Path]:
     """Check the headers of all files; return the files that can be decoded."""
+    files = [(None, "pattern_path", partial.pattern_path, partial.projector)]
+    files += [(frame.name, key, frame.paths.get(key), frame.camera) for frame in partial.frames for key in _CHECKED]
     good: set[Path] = set()
-    if partial.pattern_path is not None:
-        size = None if partial.projector is None else (partial.projector.w, partial.projector.h)
-        _check_image(partial.pattern_path, partial.root, None, size, True, "the projector", good, faults)
-    for frame in partial.frames:
-        _check_frame(frame, partial.root, good, faults)
+    for frame, key, path, device in files:
+        if path is not None:
+            problems = list(_header_problems(key, path, device))
+            for problem in problems:
+                faults.add(problem, relative(path, partial.root), frame)
+            if not problems:
+                good.add(path)
     return good
 
 
@@ -460,54 +433,18 @@ def relative(path: Path, root: Path) -> str:
     return path.relative_to(root).as_posix()
 
 
-def _check_frame(frame: PartialFrame, root: Path, good: set[Path], faults: Faults) -> None:
-    size = None if frame.camera is None else (frame.camera.w, frame.camera.h)
-    for key in ("file_path", "sl_pattern_path", "mask_path", "sl_color_path"):
-        if key in frame.paths:
-            _check_image(
-                frame.paths[key], root, frame.name, size, key not in _MAY_BE_COLOUR, "the camera", good, faults
-            )
-    path = frame.paths.get("sl_coords_path")
-    if path is None:
-        return
+def _header_problems(key: str, path: Path, device: Device | None) -> Iterator[Problem | FileError]:
+    """What is wrong with a file by its header; `device` has the size that it must have, None if that is not known."""
     try:
-        found = read_coords_size(path)
+        header = None if key == "sl_coords_path" else read_header(path)
+        size = read_coords_size(path) if header is None else (header.w, header.h)
     except FileError as error:
-        faults.add(error, relative(path, root), frame.name)
+        yield error
         return
-    if size is not None and found != size:
-        faults.add(_wrong_size(found, size, "the camera"), relative(path, root), frame.name)
-    else:
-        good.add(path)
-
-
-def _check_image(
-    path: Path,
-    root: Path,
-    frame: str | None,
-    size: tuple[int, int] | None,
-    grey_only: bool,
-    device: str,
-    good: set[Path],
-    faults: Faults,
-) -> None:
-    try:
-        header = read_header(path)
-    except FileError as error:
-        faults.add(error, relative(path, root), frame)
-        return
-    found = (header.w, header.h)
-    before = len(faults.found)
-    if size is not None and found != size:
-        faults.add(_wrong_size(found, size, device), relative(path, root), frame)
-    if grey_only and header.mode != "grey":
-        faults.add(
-            Problem("is in colour", "it was saved by a program that writes only RGB", "save it as grey, 8 or 16 bit"),
-            relative(path, root),
-            frame,
-        )
-    if len(faults.found) == before:
-        good.add(path)
+    if device is not None and size != (device.w, device.h):
+        yield _wrong_size(size, (device.w, device.h), "the projector" if key == "pattern_path" else "the camera")
+    if header is not None and header.mode != "grey" and key not in _MAY_BE_COLOUR:
+        yield Problem("is in colour", "it was saved by a program that writes only RGB", "save it as grey, 8 or 16 bit")
 
 
 def _wrong_size(found: tuple[int, int], wanted: tuple[int, int], device: str) -> Problem:

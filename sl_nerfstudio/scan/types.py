@@ -47,8 +47,7 @@ def read_device(fields: Fields, kind: str) -> Device | None:
     numbers = {k: v for k, v in values.items() if v is not None}
     if model is None or w is None or h is None or len(numbers) != len(values):
         return None
-    fl_x, fl_y, cx, cy, k1, k2, p1, p2 = numbers.values()
-    device = Device(w, h, fl_x, fl_y, cx, cy, k1, k2, p1, p2, "DOE" if model == "DOE" else "OPENCV")
+    device = Device(w, h, *numbers.values(), model="DOE" if model == "DOE" else "OPENCV")
     problems = list(device_problems(device))
     for field, problem in problems:
         fields.faults.add(problem, fields.file, fields.frame, fields.prefix + field)
@@ -58,25 +57,21 @@ def read_device(fields: Fields, kind: str) -> Device | None:
 def device_problems(device: Device) -> Iterator[tuple[str, Problem]]:
     """(key, problem) of every number of a device that cannot be right."""
     if device.w * device.h > MAX_PIXELS:
-        yield (
-            "w",
-            Problem(
-                f"times h is {device.w * device.h} pixels", "a typing error", "give the size of the image in pixels"
-            ),
+        problem = Problem(
+            f"times h is {device.w * device.h} pixels", "a typing error", "give the size of the image in pixels"
         )
+        yield "w", problem
         return
     focal_problems = list(_focal_problems(device))
     yield from focal_problems
     for key, size, centre in (("cx", device.w, device.cx), ("cy", device.h, device.cy)):
         if not -2 * size <= centre <= 3 * size:  # lens shift moves it outside the image, but not that far
-            yield (
-                key,
-                Problem(
-                    f"is {centre:g}, far outside an image of {size} pixels",
-                    "the intrinsics are those of another resolution or in another unit",
-                    "give the principal point in pixels of this image",
-                ),
+            problem = Problem(
+                f"is {centre:g}, far outside an image of {size} pixels",
+                "the intrinsics are those of another resolution or in another unit",
+                "give the principal point in pixels of this image",
             )
+            yield key, problem
     if not focal_problems and any(getattr(device, k) for k in DISTORTION):
         yield from _distortion_problems(device)
 
@@ -85,46 +80,37 @@ def _focal_problems(device: Device) -> Iterator[tuple[str, Problem]]:
     for key, focal in (("fl_x", device.fl_x), ("fl_y", device.fl_y)):
         size = max(device.w, device.h)
         if focal <= 0:
-            yield (
-                key,
-                Problem(
-                    f"is {focal:g}",
-                    "it was not filled in, or has the sign of OpenGL's projection",
-                    "give the focal length in pixels, a number greater than 0",
-                ),
+            problem = Problem(
+                f"is {focal:g}",
+                "it was not filled in, or has the sign of OpenGL's projection",
+                "give the focal length in pixels, a number greater than 0",
             )
+            yield key, problem
         elif not _WIDEST * size <= focal <= _NARROWEST * size:
-            yield (
-                key,
-                Problem(
-                    f"is {focal:g} pixels, which is impossible for an image of {size} pixels",
-                    "it was given in millimetres, as a fraction of the image, or for another resolution",
-                    "give the focal length in pixels of this image",
-                ),
+            problem = Problem(
+                f"is {focal:g} pixels, which is impossible for an image of {size} pixels",
+                "it was given in millimetres, as a fraction of the image, or for another resolution",
+                "give the focal length in pixels of this image",
             )
+            yield key, problem
 
 
 def _distortion_problems(device: Device) -> Iterator[tuple[str, Problem]]:
     """Every pixel must return to its place when it is undistorted and distorted again, from a place not far away."""
-    x, y = torch.meshgrid(
-        torch.linspace(0, device.w, 33, dtype=torch.float64),
-        torch.linspace(0, device.h, 33, dtype=torch.float64),
-        indexing="xy",
-    )
-    uv = torch.stack([x, y], -1)
+    sides = (torch.linspace(0, size, 33, dtype=torch.float64) for size in (device.w, device.h))
+    uv = torch.stack(torch.meshgrid(*sides, indexing="xy"), -1)
     # The distortion does not depend on the model (pinhole or DOE); a pinhole has no limit at 90 degrees.
     intrinsics = Intrinsics.of(replace(device, model="OPENCV"), torch.float64)
     directions = unproject(intrinsics, uv)
+    remedy = "give k1, k2, p1, p2 as OpenCV defines them, fitted over the whole image"
     again, in_front = project(intrinsics, directions)
     if not (in_front.all() and ((again - uv).abs() < _ROUND_TRIP_PX).all()):
-        yield (
-            "k1",
-            Problem(
-                "and the other distortion terms fold the image over itself: two directions share a pixel",
-                "the terms are of another model, in another order, or were fitted without points near the corners",
-                "give k1, k2, p1, p2 as OpenCV defines them, fitted over the whole image",
-            ),
+        problem = Problem(
+            "and the other distortion terms fold the image over itself: two directions share a pixel",
+            "the terms are of another model, in another order, or were fitted without points near the corners",
+            remedy,
         )
+        yield "k1", problem
         return
     straight = directions[..., :2] / -directions[..., 2:]
     bent = (uv - uv.new_tensor([device.cx, device.cy])) / uv.new_tensor([device.fl_x, device.fl_y])
@@ -132,14 +118,12 @@ def _distortion_problems(device: Device) -> Iterator[tuple[str, Problem]]:
     ends = float(stretch.min()), float(stretch.max())
     extreme = [value for value in ends if not _LEAST_STRETCH <= value <= _MOST_STRETCH]
     if extreme:
-        yield (
-            "k1",
-            Problem(
-                f"and the other distortion terms multiply distances from the principal point by {extreme[0]:.2g}",
-                "a slip, terms of another model or in another order, or a fit to too few points; no lens does that",
-                "give k1, k2, p1, p2 as OpenCV defines them, fitted over the whole image",
-            ),
+        problem = Problem(
+            f"and the other distortion terms multiply distances from the principal point by {extreme[0]:.2g}",
+            "a slip, terms of another model or in another order, or a fit to too few points; no lens does that",
+            remedy,
         )
+        yield "k1", problem
 
 
 # The scan.
@@ -481,10 +465,7 @@ def _surface_point(scan: Scan, end: PickedPixel, poses: DevicePoses) -> Float64[
     uv = np.stack([column, row], 1) + 0.5
     near = np.linalg.norm(uv - end.pixel, axis=1) < NEAR_PX
     camera, projector = Intrinsics.of(frame.camera, torch.float64), Intrinsics.of(scan.projector, torch.float64)
-    T_camera, T_projector = (
-        torch.from_numpy(poses.T_world_camera[index]),
-        torch.from_numpy(poses.T_world_projector[index]),
-    )
+    T_camera, T_projector = (torch.from_numpy(T[index]) for T in (poses.T_world_camera, poses.T_world_projector))
     uv_projector = torch.from_numpy(coords[row[near], column[near]].astype(np.float64))
     points = triangulate(camera, T_camera, torch.from_numpy(uv[near]), projector, T_projector, uv_projector)
     depth = points.depth_camera.numpy()

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
 from sl_nerfstudio.errors import Fault, ScanError, UserError
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.devices import PARAMETERS, Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.scan.document import (
     TRANSFORMS,
@@ -31,8 +31,6 @@ from sl_nerfstudio.scan.types import FORMAT, UNITS, GroundTruth, PoseSigma, Scal
 from sl_nerfstudio.storage import NewFolder, write_atomic
 
 # Writing a scan folder, one frame at a time.
-
-_INTRINSICS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
 class ScanWriter:
@@ -73,21 +71,19 @@ class ScanWriter:
         if pattern.shape != (projector.h, projector.w):
             raise ValueError(f"the pattern is {pattern.shape}, the projector {(projector.h, projector.w)}")
         self.root = root = Path(root)
-        self._camera = camera
-        self._projector = projector
+        self._camera, self._scale = camera, scale
         self._head: dict[str, Any] = {
             "sl_format": FORMAT,
             "units": units,
             **(device_fields(camera, "camera_model") if camera else {}),
+            "projector": {
+                **device_fields(projector, "model"),
+                "pattern_path": "pattern.png",
+                **(projector_extra or {}),
+            },
+            "scale": scale_record(scale),
+            **(extra or {}),
         }
-        self._head["projector"] = {
-            **device_fields(projector, "model"),
-            "pattern_path": "pattern.png",
-            **(projector_extra or {}),
-        }
-        self._head["scale"] = scale_record(scale)
-        self._scale = scale
-        self._head.update(extra or {})
         self._frames: list[dict[str, Any]] = []
         self._truth: list[dict[str, Any]] = []
         self._folder, self._own = within or NewFolder(root), within is None
@@ -145,11 +141,8 @@ class ScanWriter:
         device = camera or self._camera
         if device is None:
             raise ValueError("a frame needs its own camera if there are no common intrinsics")
-        if (
-            any(f["file_path"] == f"images/{name}.png" for f in self._frames)
-            or name in ("", ".", "..")
-            or Path(name).name != name
-        ):
+        twice = any(frame["file_path"] == f"images/{name}.png" for frame in self._frames)
+        if twice or name in ("", ".", "..") or Path(name).name != name:
             raise ValueError(f"frame name {name!r} was given before or is not a file name")
         arrays = {"image": image, "coords": coords, "pattern": pattern, "mask": mask, "color": color}
         for what, array in arrays.items():
@@ -210,13 +203,13 @@ class ScanWriter:
 
 def device_fields(device: Device, model_key: str) -> dict[str, Any]:
     """A device as keys of transforms.json; `model_key` is "camera_model" or "model"."""
-    return {model_key: device.model, **{key: getattr(device, key) for key in _INTRINSICS}}
+    return {model_key: device.model, **{key: getattr(device, key) for key in ("w", "h", *PARAMETERS)}}
 
 
 def pose_fields(T_world_camera: Float[ndarray, "4 4"], T_world_projector: Float[ndarray, "4 4"]) -> dict[str, Any]:
     """Both poses of a frame as keys of transforms.json. Raises ValueError unless they are rigid motions."""
     fields: dict[str, Any] = {}
-    for key, T in (("transform_matrix", T_world_camera), ("projector_transform_matrix", T_world_projector)):
+    for key, T in zip(POSES, (T_world_camera, T_world_projector), strict=True):
         problem = pose_problem(np.asarray(T, dtype=np.float64))
         if problem is not None:
             raise ValueError(f"{key} {problem.problem}")
@@ -237,7 +230,6 @@ def encode_json(document: dict[str, Any]) -> bytes:
 # Poses and devices in another transforms.json: true ones read, refined ones written.
 
 GROUND_TRUTH = "ground_truth"
-_FOCAL_AND_CENTRE = ("fl_x", "fl_y", "cx", "cy")
 
 
 def write_transforms(
@@ -259,7 +251,7 @@ def write_transforms(
     extras = [{}] * len(scan.frames) if extra_frame_fields is None else extra_frame_fields
     if not len(poses) == len(extras) == len(scan.frames):
         raise ValueError(f"{len(scan.frames)} frames, but poses of {len(poses)} and {len(extras)} sets of fields")
-    document = _read(scan.root / TRANSFORMS, str(scan.root))
+    document = _read(scan.root / TRANSFORMS)
     names = [frame_label(record, index) for index, record in enumerate(document["frames"])]
     if names != [frame.name for frame in scan.frames]:
         changed = "lists other frames than before", "it was changed after it was read", "start again"
@@ -285,7 +277,7 @@ def _put_devices(document: Record, scan: Scan) -> None:
 
 
 def _replace(record: Record, device: Device | None) -> None:
-    for key in _FOCAL_AND_CENTRE:
+    for key in PARAMETERS[:4]:  # focal lengths and principal point
         record.pop(key, None)
         if device is not None:
             record[key] = getattr(device, key)
@@ -296,30 +288,19 @@ def read_devices(path: Path, scan: Scan) -> Scan:
 
     Frames are matched by name. Raises ScanError for a device whose numbers cannot be right.
     """
-    document = _read(path, str(path.parent))
-    faults = Faults()
-    projector, cameras = _document_devices(document, path.name, faults)
+    document, faults = _read(path), Faults()
+    top, section, projector = Fields(document, faults, path.name), document.get("projector"), None
+    if isinstance(section, dict) and "fl_x" in section:
+        projector = read_device(Fields(section, faults, path.name, prefix="projector."), "projector")
+    cameras = {
+        name: read_frame_camera(Fields(record, faults, path.name, name), top)
+        for name, record in _records(document).items()
+        if "fl_x" in record or "fl_x" in document
+    }
     if faults.found:
         raise ScanError(faults.found, str(path.parent))
-    frames = tuple(replace(frame, camera=cameras.get(frame.name, frame.camera)) for frame in scan.frames)
+    frames = tuple(replace(frame, camera=cameras.get(frame.name) or frame.camera) for frame in scan.frames)
     return replace(scan, projector=projector or scan.projector, frames=frames)
-
-
-def _document_devices(document: Record, file: str, faults: Faults) -> tuple[Device | None, dict[str, Device]]:
-    """The projector, and the camera of each frame by its name, as far as the document has them."""
-    top = Fields(document, faults, file)
-    section = document.get("projector")
-    projector = None
-    if isinstance(section, dict) and "fl_x" in section:
-        projector = read_device(Fields(section, faults, file, prefix="projector."), "projector")
-    cameras: dict[str, Device] = {}
-    for index, record in enumerate(document["frames"]):
-        if "fl_x" in record or "fl_x" in document:
-            name = frame_label(record, index)
-            camera = read_frame_camera(Fields(record, faults, file, name), top)
-            if camera is not None:
-                cameras[name] = camera
-    return projector, cameras
 
 
 def read_poses(path: Path, scan: Scan) -> DevicePoses:
@@ -329,7 +310,7 @@ def read_poses(path: Path, scan: Scan) -> DevicePoses:
     ScanError if a frame of the scan is missing, or a pose is faulty or missing, FileError if no frame has one of the
     two kinds of poses.
     """
-    cameras, projectors = _read_both_kinds(path, scan)
+    cameras, projectors = _both_kinds(_read(path), path, scan)
     if cameras is None or projectors is None:
         missing = POSES[0] if cameras is None else POSES[1]
         raise FileError(
@@ -345,37 +326,38 @@ def read_ground_truth(scan: Scan) -> GroundTruth:
     """
     folder = scan.root / GROUND_TRUTH
     mesh, transforms = folder / "mesh.ply", folder / TRANSFORMS
-    cameras, projectors = _read_both_kinds(transforms, scan) if transforms.exists() else (None, None)
+    mesh = mesh if mesh.exists() else None
+    if not transforms.exists():
+        return GroundTruth(mesh, None, None)
+    document = _read(transforms)
+    cameras, projectors = _both_kinds(document, transforms, scan)
     poses = None if cameras is None or projectors is None else DevicePoses(cameras, projectors)
-    units = _read(transforms, str(folder)).get("units") if transforms.exists() else None
-    return GroundTruth(mesh if mesh.exists() else None, poses, units if isinstance(units, str) else None)
+    units = document.get("units")
+    return GroundTruth(mesh, poses, units if isinstance(units, str) else None)
 
 
 def read_pose_sigmas(path: Path, scan: Scan) -> list[PoseSigma | None]:
     """Uncertainty of each frame's poses (`sl_pose_sigma`) in a transforms.json, None where it is not stated."""
     found: dict[str, PoseSigma] = {}
-    for index, record in enumerate(_read(path, str(path.parent))["frames"]):
+    for name, record in _records(_read(path)).items():
         sigma = record.get("sl_pose_sigma")
         if isinstance(sigma, dict) and all(isinstance(sigma.get(key), int | float) for key in SIGMA_KEYS):
-            found[frame_label(record, index)] = PoseSigma(**{key: float(sigma[key]) for key in SIGMA_KEYS})
+            found[name] = PoseSigma(**{key: float(sigma[key]) for key in SIGMA_KEYS})
     return [found.get(frame.name) for frame in scan.frames]
 
 
 def read_unplaced(path: Path, scan: Scan) -> list[str]:
     """Names of the scan's frames that a transforms.json marks as not agreeing with the others (`sl_unplaced`)."""
-    records = enumerate(_read(path, str(path.parent))["frames"])
-    marked = {frame_label(record, index) for index, record in records if record.get("sl_unplaced") is True}
-    return [frame.name for frame in scan.frames if frame.name in marked]
+    records = _records(_read(path))
+    return [f.name for f in scan.frames if f.name in records and records[f.name].get("sl_unplaced") is True]
 
 
-def _read_both_kinds(
-    path: Path, scan: Scan
+def _both_kinds(
+    document: Record, path: Path, scan: Scan
 ) -> tuple[Float64[ndarray, "n 4 4"] | None, Float64[ndarray, "n 4 4"] | None]:
     """Camera and projector poses in the order of the scan's frames; None for a kind that no frame has."""
-    document = _read(path, str(path.parent))
-    faults = Faults()
+    faults, records = Faults(), _records(document)
     document_faults(document, path.name, faults)
-    records = {frame_label(record, index): record for index, record in enumerate(document["frames"])}
     present = {key: any(key in record for record in records.values()) for key in POSES}
     found: dict[str, list[Float64[ndarray, "4 4"] | None]] = {key: [] for key in POSES}
     for frame in scan.frames:
@@ -397,18 +379,20 @@ def _read_both_kinds(
     return np.stack(cameras) if cameras else None, np.stack(projectors) if projectors else None
 
 
-def _read(path: Path, where: str) -> Record:
-    faults = Faults()
+def _records(document: Record) -> dict[str, dict[str, Any]]:
+    """The frames of a document by their names."""
+    return {frame_label(record, index): record for index, record in enumerate(document["frames"])}
+
+
+def _read(path: Path) -> Record:
+    """A transforms.json with a list of frames. Raises ScanError for anything else."""
     try:
         document = read_document(path)
     except FileError as error:
-        faults.add(error, path.name)
-        raise ScanError(faults.found, where) from error
+        fault = Fault(path.name, None, None, error.problem, error.cause, error.remedy)
+        raise ScanError([fault], str(path.parent)) from error
     frames = document.get("frames")
     if not isinstance(frames, list) or not all(isinstance(record, dict) for record in frames):
-        problem = Problem(
-            "is missing or is not a list of objects", "the file is not a transforms.json", "give one with frames"
-        )
-        faults.add(problem, path.name, None, "frames")
-        raise ScanError(faults.found, where)
+        wrong = "is missing or is not a list of objects", "the file is not a transforms.json", "give one with frames"
+        raise ScanError([Fault(path.name, None, "frames", *wrong)], str(path.parent))
     return document

@@ -49,12 +49,7 @@ def make_scene(
     for _ in range(1000):
         if len(views) == count:
             break
-        T = np.eye(4)
-        angles = [*rng.uniform(-spread, spread, 2), rng.uniform(-20, 20)]
-        T[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
-        z = rng.uniform(*depths)
-        middle = [rng.uniform(-0.25, 0.25) * z, rng.uniform(-0.2, 0.2) * z, -z]
-        T[:3, 3] = middle - T[:3, :3] @ POINTS.mean(0)
+        T = _board_pose(rng, spread, depths, (0.25, 0.2))
         whole = _corners(camera, T)
         lit = None if projector is None else _corners(projector, T_pc @ T)
         if len(whole.ids) < len(POINTS) or (lit is not None and 2 * len(lit.ids) < len(POINTS)):
@@ -70,11 +65,7 @@ def equidistant_scene(seed: int, count: int, noise: float) -> Scene:
     rng = np.random.default_rng(seed)
     camera, views, poses = Device(1280, 960, 815.0, 815.0, 652.0, 470.0), [], []
     while len(views) < count:
-        T = np.eye(4)
-        angles = [*rng.uniform(-40, 40, 2), rng.uniform(-20, 20)]
-        T[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
-        z = rng.uniform(250, 500)
-        T[:3, 3] = [rng.uniform(-0.75, 0.75) * z, rng.uniform(-0.55, 0.55) * z, -z] - T[:3, :3] @ POINTS.mean(0)
+        T = _board_pose(rng, 40.0, (250.0, 500.0), (0.75, 0.55))
         x, y, depth = ((POINTS @ T[:3, :3].T + T[:3, 3]) * [1, -1, -1]).T
         radius = np.hypot(x, y)
         uv = (camera.cx, camera.cy) + (camera.fl_x * np.arctan2(radius, depth) / radius)[:, None] * np.c_[x, y]
@@ -84,6 +75,18 @@ def equidistant_scene(seed: int, count: int, noise: float) -> Scene:
             views.append(BoardView(f"pose {len(views)}", _noisy(corners, noise, rng), None))
             poses.append(T)
     return Scene(views, BoardRig(camera, None, np.array(poses), np.eye(4)))
+
+
+def _board_pose(
+    rng: np.random.Generator, spread: float, depths: tuple[float, float], sides: tuple[float, float]
+) -> ndarray:
+    """A board turned by up to `spread` degrees; its middle lies up to `sides` of its depth beside the axis."""
+    T = np.eye(4)
+    angles = [*rng.uniform(-spread, spread, 2), rng.uniform(-20, 20)]
+    T[:3, :3] = Rotation.from_euler("xyz", angles, degrees=True).as_matrix()
+    z = rng.uniform(*depths)
+    T[:3, 3] = [*(rng.uniform(-side, side) * z for side in sides), -z] - T[:3, :3] @ POINTS.mean(0)
+    return T
 
 
 def _relative_pose(projector: Device, distance: float) -> ndarray:

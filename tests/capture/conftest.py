@@ -24,9 +24,21 @@ class Keyboard:
         event = self.pygame.event.Event
         return event(self.pygame.NOEVENT) if key is None else event(self.pygame.KEYDOWN, key=key)
 
+    def seen(self, w: int, h: int) -> np.ndarray:
+        """What the middle of the display shows now, grey; black before there is anything."""
+        surface = self.pygame.display.get_surface()
+        shown = np.zeros((768, 1024), np.uint8) if surface is None else self.pygame.surfarray.array_red(surface).T
+        return middle(shown, w, h)
+
     def different(self) -> list[np.ndarray]:
         """What was shown, without repetitions in a row."""
         return [a for k, a in enumerate(self.shown) if k == 0 or not np.array_equal(a, self.shown[k - 1])]
+
+
+def middle(screen: np.ndarray, w: int, h: int) -> np.ndarray:
+    """A part of the display of SDL's dummy driver."""
+    left, top = (1024 - w) // 2, (768 - h) // 2
+    return screen[top : top + h, left : left + w]
 
 
 @pytest.fixture

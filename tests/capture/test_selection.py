@@ -53,19 +53,13 @@ def test_views_that_are_known_are_not_kept_again_even_later():
     assert selection.judge(view(25.0), 60.0) is SelectionVerdict.KEEP
 
 
-def test_after_a_frame_there_is_a_pause():
-    selection = Selection((10, 10))
-    selection.add(view(), 5.0)
-    assert (
-        selection.judge(view(30.0), 5.9) is SelectionVerdict.WAIT
-        and selection.judge(view(30.0), 6.0) is SelectionVerdict.KEEP
-    )
-
-
-def test_frames_of_an_earlier_run_cause_no_pause():
+def test_after_a_frame_there_is_a_pause_but_none_after_those_of_an_earlier_run():
     selection = Selection((10, 10))
     selection.add(view())
     assert selection.judge(view(30.0), 0.0) is SelectionVerdict.KEEP
+    selection.add(view(), 5.0)
+    assert selection.judge(view(30.0), 5.9) is SelectionVerdict.WAIT
+    assert selection.judge(view(30.0), 6.0) is SelectionVerdict.KEEP
 
 
 def test_how_often_each_node_was_seen():

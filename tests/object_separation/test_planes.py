@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.object_separation import planes
 from sl_nerfstudio.object_separation.planes import (
     DecodedFrame,
@@ -72,11 +73,9 @@ def test_poses_that_disagree_show_as_noise(cases):
     good = cross_frame_noise(points, [normals_of(p) for p in points])
     lifted = []
     for k, frame in enumerate(frames):
-        up = np.eye(4)
-        up[2, 3] = 1.5 * (-1) ** k
-        lifted.append(
-            replace(frame, T_world_camera=up @ frame.T_world_camera, T_world_projector=up @ frame.T_world_projector)
-        )
+        S = Similarity(1.0, np.eye(3), np.array([0.0, 0.0, 1.5 * (-1) ** k]))
+        T_camera, T_projector = S.poses(frame.T_world_camera), S.poses(frame.T_world_projector)
+        lifted.append(replace(frame, T_world_camera=T_camera, T_world_projector=T_projector))
     apart = [points_of(f.thinned(1500)) for f in lifted]
     assert cross_frame_noise(apart, [normals_of(p) for p in apart]) > 2 * good
     assert cross_frame_noise(points[:1], [normals_of(points[0])]) == 1.0
@@ -101,10 +100,13 @@ def test_a_fit_gives_back_the_plane_whatever_the_weights(seed):
 # Planes in clouds with outliers and curved parts.
 
 
+SIGMA = 0.1
+
+
 def _seen(p, camera=(20.0, -30.0, 400.0)):
     ray = p - np.array(camera)
     ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    return FramePoints(np.arange(len(p)), np.zeros(len(p), np.int64), p, ray, np.full(len(p), 0.1))
+    return FramePoints(np.arange(len(p)), np.zeros(len(p), np.int64), p, ray, np.full(len(p), SIGMA))
 
 
 def _pool(*parts):
@@ -226,14 +228,12 @@ def test_sides_of_an_object_are_part_of_it(separated, name, count, reasons):
 
 
 TABLE = Plane(np.array([0.0, 0.0, 1.0]), 0.0)
-SIGMA = 0.1
 OWN = FramePlane(TABLE, 1.0)
 
 
 def _points(p):
     """Points seen from straight above, so that sigma is that of the height."""
-    ray = np.tile([0.0, 0.0, -1.0], (len(p), 1))
-    return FramePoints(np.arange(len(p)), np.zeros(len(p), np.int64), p, ray, np.full(len(p), SIGMA))
+    return replace(_seen(p), ray=np.tile([0.0, 0.0, -1.0], (len(p), 1)))
 
 
 def _table(rng, half=50.0, count=20_000):
@@ -249,9 +249,8 @@ def test_the_tilt_and_the_height_of_a_wrong_pose_are_taken_out():
     moved[:, 2] += (true.offset - p[:, :2] @ true.normal[:2]) / true.normal[2]
     body = np.column_stack([rng.uniform(-10, 10, (1500, 2)), rng.uniform(2, 40, 1500)])
     found = plane_in_frame(TABLE, _points(np.concatenate([moved, body])), 2.0, 60.0)
-    corners = np.array(
-        [[x, y, (true.offset - true.normal[:2] @ [x, y]) / true.normal[2]] for x in (-50, 50) for y in (-50, 50)]
-    )
+    xy = np.array([[-50.0, -50.0], [-50.0, 50.0], [50.0, -50.0], [50.0, 50.0]])
+    corners = np.column_stack([xy, (true.offset - xy @ true.normal[:2]) / true.normal[2]])
     assert np.abs(found.plane.heights(corners)).max() < 0.5 * SIGMA
     assert found.noise == pytest.approx(1.0, abs=0.1)
 

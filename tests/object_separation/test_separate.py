@@ -5,8 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.object_separation.planes import DecodedFrame, Plane, ViewedRegion, points_of
 from sl_nerfstudio.object_separation.separate import Part, find_object, separate, silhouette
 
@@ -80,16 +82,9 @@ def test_the_same_frames_and_seed_give_the_same_answer(cases, separated):
 def test_lengths_have_no_say(cases):
     """In metres, and moved and turned as a whole, the answer is the same."""
     case = cases("box", "table")
-    c, s = np.cos(0.7), np.sin(0.7)
-    turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-
-    def moved(T):
-        out = np.eye(4)
-        out[:3, :3], out[:3, 3] = turn @ T[:3, :3], 0.001 * (turn @ T[:3, 3]) + [5.0, -3.0, 2.0]
-        return out
-
+    S = Similarity(0.001, Rotation.from_rotvec([0.0, 0.7, 0.0]).as_matrix(), np.array([5.0, -3.0, 2.0]))
     frames = tuple(
-        replace(f, T_world_camera=moved(f.T_world_camera), T_world_projector=moved(f.T_world_projector))
+        replace(f, T_world_camera=S.poses(f.T_world_camera), T_world_projector=S.poses(f.T_world_projector))
         for f in case.frames
     )
     other = replace(case, frames=frames)

@@ -1,16 +1,15 @@
 """Photographs of Gray-code sequences on a synthetic object, in the folders that `sl-process` takes."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from sl_nerfstudio.api import write_devices
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import sample_bilinear
 from sl_nerfstudio.scan.images import encode_png
-from sl_nerfstudio.scan.write import device_fields
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import make_setup
 
@@ -51,10 +50,6 @@ def make_gray_scan(root: Path, frames=4, resolution=160, noise=0.006, **config) 
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(encode_png(np.clip(np.rint(255 * image), 0, 255).astype(np.uint8)))
     (root / "pattern.json").write_bytes(LAYOUT.encode())
-    document = {
-        "camera": device_fields(setup.devices.camera, "model"),
-        "projector": device_fields(setup.devices.projector, "model"),
-    }
-    (root / "intrinsics.json").write_text(json.dumps(document))
+    write_devices(root / "intrinsics.json", setup.devices.camera, setup.devices.projector)
     truth = setup.truth
     return GrayScan(root, truth.T_world_camera[:frames], truth.T_world_projector[:frames], coords)

@@ -1,18 +1,18 @@
 """Captures of ramps on a synthetic object: two small images per frame, decoded quickly and almost exactly."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 
+from sl_nerfstudio.api import write_devices
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.frames import FrameJob
 from sl_nerfstudio.scan.images import encode_png
-from sl_nerfstudio.scan.write import device_fields
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import Setup, make_setup
 from tests.decoding.ramps_decoder import RampsDecoder
@@ -66,6 +66,12 @@ def make_captures(root: Path, setup: Setup, coords: Sequence[np.ndarray], names:
             (folder / f"{axis}.png").write_bytes(encode_png(np.rint(65535 * value).astype(np.uint16)))
     (root / "pattern.json").write_bytes(LAYOUT.encode())
     camera, projector = setup.devices.camera, setup.devices.projector
-    document = {"camera": device_fields(camera, "model"), "projector": device_fields(projector, "model")}
-    (root / "intrinsics.json").write_text(json.dumps(document))
+    write_devices(root / "intrinsics.json", camera, projector)
     return RampScan(root, camera, projector, setup.truth.T_world_camera[: len(names)], tuple(coords))
+
+
+def write_poses(path: Path, poses: Mapping[str, np.ndarray], **extra) -> Path:
+    """A transforms.json with camera poses by the names of their frames."""
+    frames = [{"file_path": f"x/{name}.png", "transform_matrix": np.asarray(T).tolist()} for name, T in poses.items()]
+    path.write_text(json.dumps({"frames": frames, **extra}))
+    return path

@@ -83,20 +83,15 @@ def test_all_files_with_the_same_fault_are_named_together(tmp_path):
     assert "has 7 faults: 1.png, 2.png, 3.png, 4.png, 5.png and 2 more: each is transparent in places" in str(fault)
 
 
+INSIDE = r"holds its captures in a folder of its own, images(.*\n)*.*give --images .*/images$"
+
+
 @pytest.mark.parametrize(
     ("sequences", "files", "message"),
     [
         (False, ["a.png"], "holds 1 images; a scan needs at least 2 frames"),
-        (
-            False,
-            ["images/1.png", "images/2.png"],
-            r"holds its captures in a folder of its own, images(.*\n)*.*/images$",
-        ),
-        (
-            True,
-            ["images/p/1.png", "images/q/1.png"],
-            r"in a folder of its own, images(.*\n)*.*give --images .*/images$",
-        ),
+        (False, ["images/1.png", "images/2.png"], INSIDE),
+        (True, ["images/p/1.png", "images/q/1.png"], INSIDE),
         (False, ["x/1.png", "y/1.png"], "holds 0 images.*\n.*do not suit the pattern: a coded grid needs"),
         (True, ["1.png", "2.png"], "holds 0 folders with images.*\n.*do not suit the pattern"),
         (False, ["a.png", "a.jpg", "b.png"], "several images named a"),
@@ -111,8 +106,6 @@ def test_folders_that_hold_no_captures(tmp_path, sequences, files, message):
 
 
 SIZE = (320, 240)
-
-
 OPENCV = GrayCode.in_order("opencv", *SIZE, 1)
 
 
@@ -169,9 +162,8 @@ def test_several_cameras_take_turns_each_with_its_own_intrinsics(tmp_path):
     path.write_text(json.dumps(document))
     assert camera_names(path) == ("left", "right")
     for name, size in (("left", (16, 12)), ("right", (20, 10))):
-        (tmp_path / "c" / name).mkdir(parents=True)
         for k in range(2):
-            Image.new("L", size, 90).save(tmp_path / "c" / name / f"{k}.png")
+            _write(tmp_path / "c" / name / f"{k}.png", *size)
     captures = find_captures(tmp_path / "c", False, camera_names(path))
     assert [frame.name for frame in captures.frames] == ["left_0", "right_0", "left_1", "right_1"]
     assert captures.sizes == {"left": (16, 12), "right": (20, 10)} and not captures.faults
@@ -184,7 +176,7 @@ def test_several_cameras_take_turns_each_with_its_own_intrinsics(tmp_path):
 
 def test_a_photograph_turned_by_its_tag_is_told_from_a_cropped_one(tmp_path):
     for k in range(3):
-        Image.new("L", (16, 12), 90).save(tmp_path / f"{k}.jpg")
+        _write(tmp_path / f"{k}.jpg")
     exif = Image.Exif()
     exif[0x0112] = 6
     Image.new("L", (16, 12), 90).save(tmp_path / "3.jpg", exif=exif)
@@ -193,8 +185,7 @@ def test_a_photograph_turned_by_its_tag_is_told_from_a_cropped_one(tmp_path):
 
 
 def test_a_video_of_gray_code_is_refused(tmp_path):
-    (tmp_path / "pattern").write_bytes(OPENCV.encode())
-    (tmp_path / "pattern").rename(tmp_path / "p.json")
+    (tmp_path / "p.json").write_bytes(OPENCV.encode())
     (tmp_path / "v.mp4").write_bytes(b"x")
     with pytest.raises(UserError, match=r"v.mp4: is a video, and Gray code needs one image for each pattern"):
         read_captured(config(tmp_path, images=tmp_path / "v.mp4", pattern=tmp_path / "p.json"))
@@ -206,11 +197,9 @@ def test_the_networks_are_computed_where_the_flag_says(tmp_path, monkeypatch, de
     monkeypatch.setattr(inputs, "usable_device", lambda asked: (asked, f"said of {asked}"))
     monkeypatch.setattr(inputs, "networks_for_all_processes", lambda device: networks)
     (tmp_path / "p.json").write_bytes(GridPattern().encode())
-    images = tmp_path / "images"
-    images.mkdir()
     for k in range(3):
-        _write(images / f"{k}.png")
-    captured = read_captured(replace(config(tmp_path, images=images, pattern=tmp_path / "p.json"), device=device))
+        _write(tmp_path / "images" / f"{k}.png")
+    captured = read_captured(config(tmp_path, pattern=tmp_path / "p.json", device=device))
     assert captured.decoder.networks is (networks if device == "cuda" else None)
     assert captured.notes.sentences == (f"said of {device}",)
 

@@ -36,16 +36,15 @@ from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_b
 from tests.relative_pose.known_pose import known_pose
 
 SIZE, FRAMES, MOVED = 100, 7, 3
-
-
 RIG = part_of(rig_of(18, SIZE), list(range(FRAMES)))
-
-
 NAMES = tuple(f"frame_{k:05d}" for k in range(FRAMES))
-
-
 BRIEF = AdjustmentSettings(anchors_per_frame=120, max_iterations=12, further_searches=False)
 QUICK = RegisteredFramesSettings(adjustment=BRIEF)
+CONTRADICTION = f"the coordinates of {NAMES[MOVED]} contradict those of the other frames; adjusting again without them"
+
+
+def placed(*frames):
+    return f"placed against the adjusted frames: {', '.join(NAMES[k] for k in frames)}; adjusting again with them"
 
 
 @pytest.fixture(autouse=True)
@@ -103,12 +102,7 @@ def test_a_frame_that_was_put_elsewhere_is_put_right_or_named_and_the_others_sta
     rotation, position, _ = errors_against(part_of(RIG, kept), poses.T_world_camera[kept], poses.baseline[kept])
     assert rotation.max() < 0.5 and position.max() < 0.01
     assert found.cross.share > 0.95 and len(found.cross.frames) == len(kept)
-    contradiction = (
-        f"the coordinates of {NAMES[MOVED]} contradict those of the other frames; adjusting again without them"
-    )
-    assert log == [] if degrees < 10 else set(log) <= {
-        contradiction, f"placed against the adjusted frames: {NAMES[MOVED]}; adjusting again with them"
-    }  # fmt: skip
+    assert set(log) <= (set() if degrees < 10 else {CONTRADICTION, placed(MOVED)})
 
 
 @pytest.mark.slow
@@ -125,7 +119,7 @@ def test_frames_come_in_one_after_the_other(clouds, monkeypatch):
     found = adjust_consistent(clouds, without_groups(true, [[1], [MOVED]]), log.append)
     assert calls == [[1, MOVED], [MOVED]] and found.registration.registered.all()
     assert found.registration.exclusions == () and np.isfinite(found.adjusted.poses.baseline).all()
-    assert log == [f"placed against the adjusted frames: {NAMES[k]}; adjusting again with them" for k in (1, MOVED)]
+    assert log == [placed(1), placed(MOVED)]
 
 
 @pytest.mark.slow
@@ -155,9 +149,7 @@ def test_a_frame_of_another_object_is_taken_out_by_name(clouds):
     assert found.registration.exclusions == (CoordinatesDisagree(NAMES[MOVED], (NAMES[MOVED],)),)
     assert found.registration.registered.tolist() == [k != MOVED for k in range(FRAMES)]
     assert found.registration.component.tolist() == [-1 if k == MOVED else 0 for k in range(FRAMES)]
-    assert log[0] == (
-        f"the coordinates of {NAMES[MOVED]} contradict those of the other frames; adjusting again without them"
-    )
+    assert log[0] == CONTRADICTION
     assert np.isnan(found.adjusted.poses.T_world_camera[MOVED]).all()
 
 
@@ -178,10 +170,7 @@ def test_a_frame_that_contradicts_again_where_it_was_placed_is_not_placed_a_thir
     assert adjusted == [[0, *everything[2:]], rest, everything, sorted([1, *rest])]
     assert np.flatnonzero(~found.registration.registered).tolist() == [MOVED]
     assert found.registration.exclusions == (CoordinatesDisagree(NAMES[MOVED], (NAMES[MOVED],)),)
-    assert log == [
-        f"the coordinates of {NAMES[MOVED]} contradict those of the other frames; adjusting again without them",
-        f"placed against the adjusted frames: {NAMES[1]}, {NAMES[MOVED]}; adjusting again with them",
-    ]
+    assert log == [CONTRADICTION, placed(1, MOVED)]
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sl_nerfstudio.api import write_devices
 from sl_nerfstudio.calibration.stated import CameraStart
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.captures import find_captures
@@ -19,9 +20,9 @@ from sl_nerfstudio.processing.inputs import (
     refine_camera,
     require_intrinsics,
 )
-from tests.processing.ramp_scan import NAMES
+from tests.processing.ramp_scan import NAMES, write_poses
 
-AT_PLACE, TURNED = np.eye(4).tolist(), np.diag([1.0, -1.0, -1.0, 1.0]).tolist()
+HERE, TURNED = np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def _poses(n=3, seed=0):
@@ -34,15 +35,9 @@ def _poses(n=3, seed=0):
     return T
 
 
-def _write(path, frames, **extra):
-    records = [{"file_path": f"images/{name}.png", "transform_matrix": T} for name, T in frames.items()]
-    path.write_text(json.dumps({"frames": records, **extra}))
-    return path
-
-
 def test_frames_are_matched_by_name(tmp_path):
     T = _poses()
-    path = _write(tmp_path / "t.json", {"c": T[2].tolist(), "a": T[0].tolist(), "x": "not read"}, units="mm")
+    path = write_poses(tmp_path / "t.json", {"c": T[2], "a": T[0], "x": "not read"}, units="mm")
     given = read_given_poses(path, ["a", "b", "c"])
     np.testing.assert_array_equal(given.T_world_camera[[0, 2]], T[[0, 2]])
     assert np.isnan(given.T_world_camera[1]).all() and given.units == "mm"
@@ -69,18 +64,14 @@ def test_alignment_recovers_axes_and_scale(count):
 @pytest.mark.parametrize(
     ("frames", "extra", "message"),
     [
-        ({"a": np.eye(4).tolist()}, {}, "has poses for fewer than two of the captures"),
-        ({"a": (2 * np.eye(4)).tolist(), "b": np.eye(4).tolist()}, {}, "a: transform_matrix"),
-        (
-            {"a": AT_PLACE, "b": TURNED},
-            {},
-            "has all captures at the same place\n.*cause:  the file holds rotations only",
-        ),
-        *(({"a": AT_PLACE, "b": AT_PLACE}, {"units": u}, "units is") for u in ("furlong", ["mm"], {}, 1, True)),
+        ({"a": HERE}, {}, "has poses for fewer than two of the captures"),
+        ({"a": 2 * HERE, "b": HERE}, {}, "a: transform_matrix"),
+        ({"a": HERE, "b": TURNED}, {}, "has all captures at the same place\n.*cause:  the file holds rotations only"),
+        *(({"a": HERE, "b": HERE}, {"units": u}, "units is") for u in ("furlong", ["mm"], {}, 1, True)),
     ],
 )
 def test_faulty_poses(tmp_path, frames, extra, message):
-    path = _write(tmp_path / "t.json", frames, **extra)
+    path = write_poses(tmp_path / "t.json", frames, **extra)
     with pytest.raises(UserError, match=message) as caught:
         read_given_poses(path, ["a", "b", "c"])
     assert "cause:" in str(caught.value) and "remedy:" in str(caught.value)
@@ -103,9 +94,8 @@ def test_the_camera_is_refined_and_its_uncertainty_stated(ramp_scan, tmp_path):
 
 
 def test_a_file_with_the_projector_alone_needs_photographs_that_state_the_focal_length(ramp_scan, tmp_path):
-    document = json.loads((ramp_scan.root / "intrinsics.json").read_text())
     path = tmp_path / "projector.json"
-    path.write_text(json.dumps({"projector": document["projector"]}))
+    write_devices(path, None, ramp_scan.projector)
     captures = find_captures(ramp_scan.root / "images", True)
     config = ramp_scan.config(tmp_path / "s")
     assert read_cameras(config, captures).first == ramp_scan.camera and not read_cameras(config, captures).several

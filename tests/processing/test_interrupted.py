@@ -1,6 +1,5 @@
 """A run that was interrupted goes on where it was, and ends with the same bytes as one that was not."""
 
-import json
 import os
 import shutil
 import signal
@@ -21,7 +20,7 @@ from sl_nerfstudio.processing.records import digest
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.storage import LOCK, NewFolder, locked
 from tests.processing.conftest import register_ramps
-from tests.processing.ramp_scan import NAMES
+from tests.processing.ramp_scan import NAMES, write_poses
 
 pytestmark = [pytest.mark.usefixtures("ramps_registered"), pytest.mark.slow]
 
@@ -94,10 +93,8 @@ def test_with_other_settings_or_another_version_frames_are_registered_again(
     ramp_scan, resumed, change, monkeypatch, tmp_path
 ):
     if "poses" in change:
-        frames = zip(NAMES, ramp_scan.T_world_camera.tolist(), strict=True)
-        document = {"frames": [{"file_path": f"{name}.png", "transform_matrix": T} for name, T in frames]}
-        change = {"poses": tmp_path / "rough.json"}
-        change["poses"].write_text(json.dumps(document))
+        poses = dict(zip(NAMES, ramp_scan.T_world_camera, strict=True))
+        change = {"poses": write_poses(tmp_path / "rough.json", poses)}
     elif "version" in change:
         change = {}
         monkeypatch.setitem(VERSIONS, "registration", VERSIONS["registration"] + 1)
@@ -188,11 +185,10 @@ def test_a_scan_that_the_user_changed_stays(resumed, change, cause):
     assert content(resumed.output) == before
 
 
-def test_a_scan_of_other_captures_stays_and_so_does_any_after_an_error(ramp_scan, resumed, monkeypatch, tmp_path):
+def test_a_scan_of_other_captures_stays_and_so_does_any_after_an_error(copy, resumed, monkeypatch):
     run(resumed)
     before = content(resumed.output)
-    shutil.copytree(ramp_scan.root, tmp_path / "c")
-    fewer = replace(resumed, images=tmp_path / "c" / "images", work=resumed.work_folder)
+    fewer = replace(resumed, images=copy.root / "images", work=resumed.work_folder)
     shutil.rmtree(fewer.images / NAMES[2])
     with pytest.raises(UserError, match=r"holds the scan of other captures(.|\n)*added, removed or replaced"):
         run(fewer)
@@ -222,10 +218,8 @@ def test_temporary_files_of_killed_workers_do_not_stay(resumed):
 
 
 def test_damaged_files_in_the_work_folder_are_made_again(whole, resumed):
-    spoilt = [
-        path for path in resumed.work_folder.rglob("*.npz") if not path.name.startswith("adjustment")
-    ]  # it is slow
-    for k, path in enumerate(sorted(spoilt)):
+    every = sorted(resumed.work_folder.rglob("*.npz"))
+    for k, path in enumerate(path for path in every if not path.name.startswith("adjustment")):  # that is slow
         text = bytearray(path.read_bytes())
         text[np.random.default_rng(k).integers(len(text))] ^= 4
         path.write_bytes(text)

@@ -19,11 +19,7 @@ from sl_nerfstudio.scan.images import encode_png
 from tests.processing.ramp_scan import NAMES
 
 W, H = 12, 9
-
-
 DRAWN = np.zeros((H, W), dtype=bool)
-
-
 DRAWN[2:7, 3:9] = True
 
 

@@ -28,7 +28,7 @@ from tests.processing.ramp_scan import NAMES, make_captures
 
 def finding(verdict):
     plane = Plane(np.array([0.0, 0.0, 1.0]), 2.0)
-    return PlaneFinding(plane, 0.6, 1.0, 0.0, 0.3, 1.0, 5.0, 1.0, 1.0, verdict)
+    return PlaneFinding(plane, 0.6, verdict)
 
 
 @pytest.fixture

@@ -9,25 +9,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
+from sl_nerfstudio.api import write_devices
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing import consistency, inputs
 from sl_nerfstudio.processing import process as stages
-from sl_nerfstudio.processing.captures import find_captures
-from sl_nerfstudio.processing.frames import FrameWorker, clouds_of
+from sl_nerfstudio.processing.frames import FrameWorker
 from sl_nerfstudio.processing.inputs import GivenPoses, frames_by_name
 from sl_nerfstudio.processing.process import process, require_given_poses, write_scan
 from sl_nerfstudio.processing.result import summarise
-from sl_nerfstudio.processing.scan_poses import find_scan_poses
-from sl_nerfstudio.registration.register import ProjectorChoice, register
+from sl_nerfstudio.registration.register import ProjectorChoice
 from sl_nerfstudio.registration.result import NoCommonSurface, Registration, UndecidedProjector, parse_known_length
 from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.images import encode_png, read_image
-from sl_nerfstudio.scan.write import device_fields
 from sl_nerfstudio.storage import NewFolder, write_atomic
 from tests.formulas import pose_errors
-from tests.processing.conftest import SHORT, register_ramps
-from tests.processing.ramp_scan import LAYOUT, NAMES
+from tests.processing.conftest import register_ramps
+from tests.processing.ramp_scan import LAYOUT, NAMES, write_poses
 
 pytestmark = pytest.mark.usefixtures("ramps_registered", "calibrated_before")
 
@@ -39,10 +36,8 @@ def _run(config):
     return process(config, lambda result, previews: f"{result.registered} of {len(previews)}", log.append), log
 
 
-def _poses(path, poses, units="mm"):
-    frames = [{"file_path": f"x/{name}.png", "transform_matrix": T.tolist()} for name, T in poses.items()]
-    path.write_text(json.dumps({"units": units, "frames": frames}))
-    return path
+def _poses(tmp_path, poses, units="mm"):
+    return write_poses(tmp_path / "r.json", poses, units=units)
 
 
 def _without(registration, names):
@@ -161,7 +156,7 @@ def test_too_few_registered_frames_with_given_poses_are_an_error_that_names_them
     """One pose gave a scale of NaN and none a ValueError, both after the whole adjustment."""
     lose(NAMES[0], NAMES[1])
     monkeypatch.setattr(stages, "adjust_consistent", lambda *_: pytest.fail("adjusted before the poses were checked"))
-    rough = _poses(tmp_path / "r.json", {NAMES[k]: ramp_scan.T_world_camera[k] for k in given})
+    rough = _poses(tmp_path, {NAMES[k]: ramp_scan.T_world_camera[k] for k in given})
     config = ramp_scan.config(tmp_path / "s", poses=rough)
     with pytest.raises(UserError) as caught:
         _run(config)
@@ -174,11 +169,9 @@ def test_too_few_registered_frames_with_given_poses_are_an_error_that_names_them
     assert "\n    cause:  " in said and said.endswith("or leave --poses out") and not config.output.exists()
 
 
-def test_given_poses_of_frames_that_cannot_be_decoded_do_not_count(ramp_scan, tmp_path):
-    shutil.copytree(ramp_scan.root, tmp_path / "c")
-    (tmp_path / "c" / "images" / NAMES[0] / "0.png").write_bytes(b"broken")
-    rough = _poses(tmp_path / "r.json", {name: ramp_scan.T_world_camera[k] for k, name in enumerate(NAMES[:2])})
-    copy = replace(ramp_scan, root=tmp_path / "c")
+def test_given_poses_of_frames_that_cannot_be_decoded_do_not_count(copy, tmp_path):
+    (copy.root / "images" / NAMES[0] / "0.png").write_bytes(b"broken")
+    rough = _poses(tmp_path, dict(zip(NAMES[:2], copy.T_world_camera[:2], strict=True)))
     with pytest.raises(UserError, match="1 of the 2 frames with given poses could be registered") as caught:
         _run(copy.config(tmp_path / "s", poses=rough))
     said = str(caught.value)
@@ -190,7 +183,7 @@ def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):
     """Which is said before anything is decoded."""
     turned = ramp_scan.T_world_camera.copy()
     turned[:, :3, 3] = (1, 2, 3)
-    rough = _poses(tmp_path / "r.json", dict(zip(NAMES, turned, strict=True)))
+    rough = _poses(tmp_path, dict(zip(NAMES, turned, strict=True)))
     config, log = ramp_scan.config(tmp_path / "s", poses=rough), []
     with pytest.raises(UserError, match=r"has all captures at the same place\n.*cause:  the file holds rotations only"):
         process(config, lambda *_: "", log.append)
@@ -211,7 +204,7 @@ def test_other_places_of_frames_that_are_left_out_give_no_unit(ramp_scan, tmp_pa
 @pytest.mark.slow
 @pytest.mark.parametrize("units", ["mm", "arbitrary"])
 def test_given_poses_give_axes_and_unit(ramp_scan, tmp_path, units):
-    rough = _poses(tmp_path / "r.json", dict(zip(NAMES[:3], ramp_scan.T_world_camera[:3], strict=True)), units)
+    rough = _poses(tmp_path, dict(zip(NAMES[:3], ramp_scan.T_world_camera[:3], strict=True)), units)
     result, _ = _run(ramp_scan.config(tmp_path / "s", poses=rough))
     scan = read_scan(tmp_path / "s")
     np.testing.assert_allclose(scan.poses.T_world_camera, ramp_scan.T_world_camera, atol=1.0)  # mm, at 960 mm
@@ -222,7 +215,7 @@ def test_given_poses_give_axes_and_unit(ramp_scan, tmp_path, units):
 
 @pytest.mark.slow
 def test_a_known_length_overrules_the_unit_of_given_poses(ramp_scan, tmp_path):
-    rough = _poses(tmp_path / "r.json", dict(zip(NAMES, ramp_scan.T_world_camera, strict=True)))
+    rough = _poses(tmp_path, dict(zip(NAMES, ramp_scan.T_world_camera, strict=True)))
     _run(ramp_scan.config(tmp_path / "s", poses=rough, known_length="baseline of frame 2 = 5 cm"))
     scan = read_scan(tmp_path / "s")
     baseline = scan.poses.baseline[2]
@@ -230,10 +223,8 @@ def test_a_known_length_overrules_the_unit_of_given_poses(ramp_scan, tmp_path):
     assert baseline == pytest.approx(5, rel=1e-5)
 
 
-def test_a_known_length_in_a_frame_that_failed_is_an_error_before_registration(monkeypatch, ramp_scan, tmp_path):
-    shutil.copytree(ramp_scan.root, tmp_path / "c")
-    (tmp_path / "c" / "images" / NAMES[1] / "0.png").write_bytes(b"broken")
-    copy = replace(ramp_scan, root=tmp_path / "c")
+def test_a_known_length_in_a_frame_that_failed_is_an_error_before_registration(monkeypatch, copy, tmp_path):
+    (copy.root / "images" / NAMES[1] / "0.png").write_bytes(b"broken")
     monkeypatch.setattr(stages, "register", lambda *_: pytest.fail("registered"))
     with pytest.raises(UserError, match=f"--known-length: {NAMES[1]} could not be used.*\n.*cause:.*\n.*remedy:"):
         _run(copy.config(tmp_path / "s", known_length="baseline of frame 1 = 5 cm"))
@@ -249,73 +240,38 @@ def test_frames_of_a_known_length_are_found_by_number_or_name():
             frames_by_name(parse_known_length(text), ["a", "b", "c"])
 
 
-ABC = ("a", "b", "c")
-
-
 ORDER = "the frames do not follow each other in the order of capture: --unordered says so"
 
 
-DOUBT = UndecidedProjector("b", 20.0)
+@pytest.mark.parametrize(
+    ("unordered", "in_order", "by_all", "calls"),
+    [
+        (False, False, (0, 1, 0), [((0, 1, 0), True)]),  # neighbours and all frames choose the same poses
+        (False, False, (0, 0, 0), [((0, 1, 0), True), ((0, 0, 0), False)]),
+        (False, True, (0, 0, 0), [((0, 1, 0), True)]),
+        (True, True, (0, 0, 0), [((0, 0, 0), False)]),
+    ],
+)
+def test_frames_are_registered_again_only_if_they_have_no_order_and_all_of_them_choose_other_poses(
+    monkeypatch, unordered, in_order, by_all, calls
+):
+    made, log, doubt = [], [], UndecidedProjector("b", 20.0)
 
+    def register(chosen, sequence, *_):
+        made.append((chosen, sequence))
+        poses = np.tile(np.eye(4) * len(made), (3, 1, 1))
+        return Registration(("a", "b", "c"), poses, np.ones(3), np.ones(3, dtype=bool), np.zeros(3, dtype=np.int64),
+                            np.ones(3), (), (), (), ordered=sequence and in_order)  # fmt: skip
 
-@pytest.fixture
-def registered(monkeypatch):
-    """Makes the choices of projectors, by neighbours and by all; lists what is registered, by which order."""
-
-    def registered(by_neighbours, by_all, in_order=False):
-        calls = []
-
-        def register(chosen, sequence, *_):
-            calls.append((chosen, sequence))
-            poses = np.tile(np.eye(4) * (1 + len(calls)), (3, 1, 1))
-            return Registration(ABC, poses, np.ones(3), np.ones(3, dtype=bool), np.zeros(3, dtype=np.int64),
-                                np.ones(3), (), (), (), ordered=sequence and in_order)  # fmt: skip
-
-        doubts = {True: (), False: (DOUBT,)}
-        choices = {True: by_neighbours, False: by_all}
-        monkeypatch.setattr(
-            stages,
-            "choose_projectors",
-            lambda clouds, sequence, _: ProjectorChoice(choices[sequence], doubts[sequence]),
-        )
-        monkeypatch.setattr(stages, "chosen_clouds", lambda clouds, chosen: chosen)
-        monkeypatch.setattr(stages, "register", register)
-        return calls
-
-    return registered
-
-
-def number(registration):
-    """Which of the calls made it."""
-    return registration.T_world_camera[0, 0, 0] - 1
-
-
-def register_abc(unordered):
-    log = []
-    return *stages.register_clouds([], unordered, 0, None, log.append), log
-
-
-def test_the_same_poses_are_registered_once_and_what_all_frames_say_of_them_counts(registered):
-    calls = registered((0, 1, 0), (0, 1, 0))
-    chosen, found, log = register_abc(unordered=False)
-    assert calls == [((0, 1, 0), True)] and log == [ORDER]
-    assert chosen == (0, 1, 0) and found.exclusions == (DOUBT,) and number(found) == 1
-
-
-def test_other_poses_are_registered_again(registered):
-    calls = registered((0, 1, 0), (0, 0, 0))
-    chosen, found, log = register_abc(unordered=False)
-    assert calls == [((0, 1, 0), True), ((0, 0, 0), False)] and log == [ORDER]
-    assert chosen == (0, 0, 0) and found.exclusions == (DOUBT,) and number(found) == 2
-
-
-@pytest.mark.parametrize("unordered", [False, True])
-def test_where_the_order_is_known_nothing_is_repeated(registered, unordered):
-    calls = registered((0, 1, 0), (0, 0, 0), in_order=True)
-    chosen, found, log = register_abc(unordered)
-    wanted = (0, 0, 0) if unordered else (0, 1, 0)
-    assert calls == [(wanted, not unordered)] and chosen == wanted and log == []
-    assert found.exclusions == ((DOUBT,) if unordered else ())
+    choices = {True: ProjectorChoice((0, 1, 0), ()), False: ProjectorChoice(by_all, (doubt,))}
+    monkeypatch.setattr(stages, "choose_projectors", lambda clouds, sequence, _: choices[sequence])
+    monkeypatch.setattr(stages, "chosen_clouds", lambda clouds, chosen: chosen)
+    monkeypatch.setattr(stages, "register", register)
+    chosen, found = stages.register_clouds([], unordered, 0, None, log.append)
+    assert made == calls and chosen == calls[-1][0] and found.T_world_camera[0, 0, 0] == len(calls)
+    compared_with_all = not in_order  # what all frames say of the projectors counts
+    assert log == [ORDER] * compared_with_all
+    assert found.exclusions == ((doubt,) if unordered or compared_with_all else ())
 
 
 def test_photographs_that_are_shrunk_give_the_same_scan_at_another_size(ramp_scan, whole, tmp_path, monkeypatch):
@@ -335,8 +291,7 @@ def test_photographs_that_are_shrunk_give_the_same_scan_at_another_size(ramp_sca
         write_atomic(large / "masks" / f"{name}.png", encode_png(mask))
         write_atomic(large / "colours" / f"{name}.png", encode_png(np.dstack([mask // 2] * 3)))
     camera = replace(ramp_scan.camera.scaled(float(factor)), w=w, h=h)
-    document = {"camera": device_fields(camera, "model"), "projector": device_fields(ramp_scan.projector, "model")}
-    (large / "intrinsics.json").write_text(json.dumps(document))
+    write_devices(large / "intrinsics.json", camera, ramp_scan.projector)
     (large / "pattern.json").write_bytes(LAYOUT.encode())
     scan = read_scan(whole[2] / "s")
     at = [np.argwhere(np.isfinite(scan.frames[k].read_coords()[..., 0]))[400] for k in (0, 1)]
@@ -359,17 +314,10 @@ def test_photographs_that_are_shrunk_give_the_same_scan_at_another_size(ramp_sca
     np.testing.assert_allclose([end.pixel for end in small.scale.bar.ends], [rc[::-1] + 0.5 for rc in at])
 
 
-@pytest.fixture(scope="module")
-def made(ramp_scan, tmp_path_factory):
+@pytest.fixture
+def made(ramp_scan, ramp_job, results, registration, poses, tmp_path):
     """Job, results, poses and the result of a run that has not been written."""
-    job = ramp_scan.job(tmp_path_factory.mktemp("w"))
-    worker = FrameWorker(job)
-    results = [worker(frame) for frame in find_captures(ramp_scan.root / "images", True).frames]
-    clouds = clouds_of(results)
-    registration = register(clouds)
-    poses = find_scan_poses(clouds, registration, adjust_registered(clouds, registration, SHORT), None, None)
-    config = ramp_scan.config(tmp_path_factory.mktemp("s"))
-    return job, results, poses, summarise(config, "ramps", results, registration, poses)
+    return ramp_job, results, poses, summarise(ramp_scan.config(tmp_path), "ramps", results, registration, poses)
 
 
 def test_what_is_written_is_what_was_found(made, tmp_path):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sl_nerfstudio.api import write_devices
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.process import process
 from sl_nerfstudio.processing.projector import FIELDS
@@ -33,10 +34,10 @@ def rigid(tmp_path_factory):
     return _captures(tmp_path_factory.mktemp("rigid"), "rigid-rig")
 
 
-def _camera_alone(scan: RampScan, path):
-    document = json.loads((scan.root / "intrinsics.json").read_text())
-    path.write_text(json.dumps({"camera": document["camera"]}))
-    return path
+def _with_camera_alone(config, scan: RampScan):
+    path = config.output.with_name("camera.json")
+    write_devices(path, scan.camera, None)
+    return replace(config, intrinsics=path)
 
 
 def _run(config):
@@ -45,8 +46,7 @@ def _run(config):
 
 
 def test_a_projector_that_stands_still_needs_no_intrinsics(ramps_registered, still, tmp_path):
-    config = still.config(tmp_path / "s", rig="static-projector")
-    result, log = _run(replace(config, intrinsics=_camera_alone(still, tmp_path / "camera.json")))
+    result, log = _run(_with_camera_alone(still.config(tmp_path / "s", rig="static-projector"), still))
     assert result.registered == len(NAMES)
     assert any(line.startswith("projector, by resection from the cameras: focal lengths ") for line in log)
     scan = read_scan(tmp_path / "s")
@@ -67,16 +67,14 @@ def test_a_rigid_rig_has_one_relative_pose(ramps_registered, rigid, tmp_path):
 
 
 def test_a_camera_alone_in_the_file_is_an_error_that_names_the_flags(ramps_registered, ramp_scan, tmp_path):
-    config = ramp_scan.config(tmp_path / "s")
-    config = replace(config, intrinsics=_camera_alone(ramp_scan, tmp_path / "camera.json"))
+    config = _with_camera_alone(ramp_scan.config(tmp_path / "s"), ramp_scan)
     with pytest.raises(UserError, match="--estimate-projector") as caught:
         _run(config)
     assert "describes no projector" in str(caught.value)
 
 
 def test_frames_of_one_relative_pose_do_not_determine_the_projector(ramps_registered, rigid, tmp_path):
-    config = rigid.config(tmp_path / "s", estimate_projector=True)
-    config = replace(config, intrinsics=_camera_alone(rigid, tmp_path / "camera.json"))
+    config = _with_camera_alone(rigid.config(tmp_path / "s", estimate_projector=True), rigid)
     with pytest.raises(UserError, match="do not determine the projector's intrinsics") as caught:
         _run(config)
     assert "stands in the same way against the camera in all frames" in str(caught.value)
@@ -84,12 +82,11 @@ def test_frames_of_one_relative_pose_do_not_determine_the_projector(ramps_regist
 
 
 def test_a_wrong_focal_length_is_named_as_the_cause(ramps_registered, ramp_scan, tmp_path):
-    document = json.loads((ramp_scan.root / "intrinsics.json").read_text())
-    for key in ("fl_x", "fl_y"):
-        document["projector"][key] *= 1.03
-    (tmp_path / "wrong.json").write_text(json.dumps(document))
+    true = ramp_scan.projector
+    wrong = replace(true, fl_x=1.03 * true.fl_x, fl_y=1.03 * true.fl_y)
+    write_devices(tmp_path / "wrong.json", ramp_scan.camera, wrong)
     result, log = _run(replace(ramp_scan.config(tmp_path / "s"), intrinsics=tmp_path / "wrong.json"))
     (said,) = [line for line in log if line.startswith("The stated intrinsics contradict the captures")]
     value = float(re.search(r"projector, focal length ([\d.]+) ±", said)[1])
-    assert value == pytest.approx(ramp_scan.projector.fl_x, rel=3e-3) and "--estimate-projector" in said
+    assert value == pytest.approx(true.fl_x, rel=3e-3) and "--estimate-projector" in said
     assert said in result.remarks and result.verdict.band != "good"

@@ -21,13 +21,9 @@ from sl_nerfstudio.processing.captures import CapturedFrame
 from sl_nerfstudio.processing.records import DecodedStore, Manifest, decode, digest, encode
 
 _PLAIN = st.none() | st.booleans() | st.integers() | st.floats() | st.text()
-
-
 _ARRAYS = arrays.arrays(
     st.sampled_from([np.float32, np.float64, np.int64, bool]), arrays.array_shapes(min_dims=0, max_dims=3, min_side=0)
 )
-
-
 _VALUES = st.recursive(
     _PLAIN | _ARRAYS, lambda inner: st.lists(inner, max_size=3) | st.lists(inner, max_size=3).map(tuple)
 )

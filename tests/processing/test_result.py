@@ -7,10 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sl_nerfstudio.bundle_adjustment.registered_frames import adjust_registered
-from sl_nerfstudio.processing.captures import CapturedFrame, find_captures
+from sl_nerfstudio.processing.captures import CapturedFrame
 from sl_nerfstudio.processing.consistency import compare_registered
-from sl_nerfstudio.processing.frames import FrameStageResult, FrameWorker, clouds_of
+from sl_nerfstudio.processing.frames import FrameStageResult, clouds_of
 from sl_nerfstudio.processing.result import (
     EdgeRecord,
     FrameRecord,
@@ -22,8 +21,7 @@ from sl_nerfstudio.processing.result import (
     unconnected_neighbours,
     what_to_recapture,
 )
-from sl_nerfstudio.processing.scan_poses import find_scan_poses, stated_scale
-from sl_nerfstudio.registration.register import register
+from sl_nerfstudio.processing.scan_poses import stated_scale
 from sl_nerfstudio.registration.result import (
     CoordinatesDisagree,
     Exclusion,
@@ -41,39 +39,19 @@ from sl_nerfstudio.relative_pose.estimation import Degeneracy, DegeneracyKind, e
 from sl_nerfstudio.review.agreement import SurfaceShares
 from sl_nerfstudio.scan import PickedPixel, Scale
 from tests.formulas import pixels
-from tests.processing.conftest import SHORT
 from tests.processing.ramp_scan import NAMES
 from tests.relative_pose.two_views import view
 
 
-@pytest.fixture(scope="module")
-def results(ramp_scan, tmp_path_factory):
-    worker = FrameWorker(ramp_scan.job(tmp_path_factory.mktemp("w")))
-    return [worker(frame) for frame in find_captures(ramp_scan.root / "images", True).frames]
-
-
-@pytest.fixture(scope="module")
-def registration(results):
-    return register(clouds_of(results))
-
-
-@pytest.fixture(scope="module")
-def poses(results, registration):
-    clouds = clouds_of(results)
-    return find_scan_poses(clouds, registration, adjust_registered(clouds, registration, SHORT), None, None)
-
-
 @pytest.fixture
-def config(ramp_scan, tmp_path):
-    return ramp_scan.config(tmp_path)
+def summary(ramp_scan, tmp_path, results, registration, poses):
+    """Summarises the run, of which something may be otherwise."""
+    found = {"results": results, "registration": registration, "poses": poses}
+    return lambda **changes: summarise(ramp_scan.config(tmp_path), "ramps", **{**found, **changes})
 
 
-def _lost(stage, reason="x.png: is bad\n    cause:  a\n    remedy: b"):
-    return FrameStageResult(CapturedFrame("lost", ()), "k", False, 0.5, 0.25, None, stage, reason)
-
-
-def test_registered_frames_have_all_figures(config, results, registration, poses):
-    result = summarise(config, "ramps", results, registration, poses)
+def test_registered_frames_have_all_figures(summary, results):
+    result = summary()
     assert result.registered == 4 and result.decoder == "ramps"
     assert (result.units, result.scale_source) == ("arbitrary", "")
     baselines = [frame.baseline for frame in result.frames]
@@ -97,35 +75,34 @@ def test_registered_frames_have_all_figures(config, results, registration, poses
 SHARES = [SurfaceShares(0.9, 0.0), SurfaceShares(0.8, 0.01), SurfaceShares(None, None), SurfaceShares(0.7, 0.02)]
 
 
-def test_coordinates_of_the_other_frames_are_part_of_the_record(config, results, registration, poses):
+def test_coordinates_of_the_other_frames_are_part_of_the_record(summary, results, registration, poses):
     cross = compare_registered(clouds_of(results), registration, poses.adjusted)
-    result = summarise(config, "ramps", results, registration, poses, cross, SHARES)
+    result = summary(cross=cross, shares=SHARES)
     assert [frame.shared_decoded for frame in result.frames] == [0.9, 0.8, None, 0.7]
     assert [frame.missing_share for frame in result.frames] == [0.0, 0.01, None, 0.02]
-    assert (
-        result.verdict.band == "good" and result.document()["verdict"] == "good" and result.document()["reasons"] == []
-    )
+    document = result.document()
+    assert (result.verdict.band, document["verdict"], document["reasons"]) == ("good", "good", [])
     for frame, found in zip(result.frames, cross.frames, strict=True):
         assert (frame.seen_share, frame.cross_share, frame.cross_px_p95) == (found.seen, found.share, found.px_p95)
         assert found.share > 0.95
     assert result.cross_px == (cross.px_median, cross.px_p95)
 
 
-def test_an_undecided_frame_keeps_the_scan_from_being_good_and_its_sigma_says_so(config, results, registration, poses):
+def test_an_undecided_frame_keeps_the_scan_from_being_good_and_its_sigma_says_so(summary, registration):
     doubts = (UncertainRotation(NAMES[1], 7.5), UncertainRotation(NAMES[2], 2.0))
-    result = summarise(config, "ramps", results, replace(registration, uncertainties=doubts), poses)
+    result = summary(registration=replace(registration, uncertainties=doubts))
     assert result.verdict.band == "poor"
     assert result.verdict.reasons[0].startswith(f"{NAMES[1]}: rotation known only to 7.5 degrees")
     assert result.frames[1].sigma_rotation_deg == 7.5
     assert [frame.undecided for frame in result.frames] == [False, True, True, False]
     assert result.document()["frames"][1]["undecided"] is True
-    one = summarise(config, "ramps", results, replace(registration, uncertainties=doubts[1:]), poses)
+    one = summary(registration=replace(registration, uncertainties=doubts[1:]))
     assert one.verdict.band == "acceptable" and NAMES[2] in one.verdict.reasons[0]
 
 
-def test_placed_points_are_where_both_devices_see_them(config, results, registration, poses):
+def test_placed_points_are_where_both_devices_see_them(summary, results, poses):
     """Projected by hand: into the camera they are the pixels' centres, into the projector the decoded coordinates."""
-    (group,) = summarise(config, "ramps", results, registration, poses).placed
+    (group,) = summary().placed
     assert group.component == 0 and [frame.name for frame in group.frames] == list(NAMES)
     clouds = clouds_of(results)
     for k, frame in enumerate(group.frames):
@@ -138,7 +115,7 @@ def test_placed_points_are_where_both_devices_see_them(config, results, registra
         assert np.median(off) < 0.1 and off.max() < 1
 
 
-def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, results, registration, poses):
+def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(summary, results, registration):
     T = np.stack([np.eye(4), np.eye(4)])
     T[1, :3, 3] = [1.0, 2.0, 3.0]
     apart = replace(
@@ -148,7 +125,7 @@ def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, 
         exclusions=tuple(NoCommonSurface(name) for name in NAMES[2:]),
         separate=(SeparatePoses(tuple(NAMES[2:]), T, np.array([0.5, 2.0])),),
     )
-    scan, other = summarise(config, "ramps", results, apart, poses).placed
+    scan, other = summary(registration=apart).placed
     assert (scan.component, other.component) == (0, 1)
     assert [[f.name for f in g.frames] for g in (scan, other)] == [list(NAMES[:2]), list(NAMES[2:])]
     for k, frame in enumerate(other.frames):
@@ -156,10 +133,10 @@ def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, 
         baseline = np.linalg.norm(frame.T_world_projector[:3, 3] - T[k, :3, 3])
         assert baseline == pytest.approx((0.5, 2.0)[k])
         np.testing.assert_allclose(pixels(frame.camera, T[k], frame.points), frame.uv_camera, atol=0.1)
-    alone = summarise(config, "ramps", results, replace(apart, separate=()), poses).placed
+    alone = summary(registration=replace(apart, separate=())).placed
     assert [(g.component, len(g.frames)) for g in alone] == [(0, 2), (-1, 1), (-1, 1)]
     assert [g.frames[0].name for g in alone[1:]] == list(NAMES[2:])
-    nowhere = summarise(config, "ramps", results, None, None).placed  # registration was not reached
+    nowhere = summary(registration=None, poses=None).placed  # registration was not reached
     assert [g.component for g in nowhere] == [-1] * 4
     part = np.zeros(clouds_of(results)[0].coords.shape[:2], np.uint8)
     assert not len(scan.only_object({NAMES[0]: part}).frames[0].points)  # nothing of it is the object
@@ -169,41 +146,36 @@ def test_other_groups_and_single_frames_are_placed_in_axes_of_their_own(config, 
 @pytest.mark.parametrize(
     ("stage", "rate", "share"), [("reading", None, None), ("decoding", None, None), ("calibrating", 0.5, 0.25)]
 )
-def test_a_frame_that_failed_has_only_the_figures_that_were_reached(
-    config, results, registration, poses, stage, rate, share
-):
-    lost = _lost(stage)
-    frame = summarise(config, "ramps", [lost, *results], registration, poses).frames[0]
+def test_a_frame_that_failed_has_only_the_figures_that_were_reached(summary, results, registration, stage, rate, share):
+    reason = "x.png: is bad\n    cause:  a\n    remedy: b"
+    lost = FrameStageResult(CapturedFrame("lost", ()), "k", False, 0.5, 0.25, None, stage, reason)
+    frame = summary(results=[lost, *results]).frames[0]
     assert (frame.in_scan, frame.stage, frame.reason) == (False, stage, lost.reason)
     assert (frame.decode_rate, frame.mask_share) == (rate, share)
     assert frame.epipolar_px is frame.baseline is frame.fitness is None
     assert left_out(lost, registration) == (stage, lost.reason)
 
 
-def test_a_frame_that_was_not_registered_says_why(config, results, registration, poses):
+def test_a_frame_that_was_not_registered_says_why(summary, results, registration):
     alone = NoCommonSurface(NAMES[2])
     without = replace(registration, registered=np.array([True, True, False, True]), exclusions=(alone,))
-    frame = summarise(config, "ramps", results, without, poses).frames[2]
+    frame = summary(registration=without).frames[2]
     assert (frame.in_scan, frame.stage, frame.reason) == (False, "registering", exclusion_sentence(alone))
     assert vars(frame)["epipolar_px"] < 0.01 and frame.baseline is None and frame.fitness is None
     assert left_out(results[0], without) is None
 
 
 @pytest.mark.parametrize("registered", [False, True])
-def test_without_a_scan_every_frame_is_left_out_for_a_reason(config, results, registration, registered):
-    result = summarise(config, "ramps", results, registration if registered else None, None)
+def test_without_a_scan_every_frame_is_left_out_for_a_reason(summary, registration, registered):
+    result = summary(registration=registration if registered else None, poses=None)
     assert result.registered == 0 and result.joint_px is None and result.units == "arbitrary"
     assert {(f.stage, f.reason) for f in result.frames} == {("registering", "too few other frames could be used")}
 
 
-def test_residuals_that_do_not_exist_are_left_out(config, results, registration, poses):
+def test_residuals_that_do_not_exist_are_left_out(summary, poses):
     none = replace(poses, adjusted=replace(poses.adjusted, median_before_px=np.nan, median_after_px=np.nan))
-    result = summarise(config, "ramps", results, registration, none)
+    result = summary(poses=none)
     assert result.joint_px is None and result.document()["joint_adjustment_px"] is None
-
-
-def _frame(name, **values):
-    return FrameRecord(name, **values)
 
 
 def _edge(a, b, used=True):
@@ -212,12 +184,14 @@ def _edge(a, b, used=True):
 
 def test_every_reason_is_named():
     frames = [
-        _frame("a", decode_rate=0.3, mask_share=0.4, fitness=0.95),
-        _frame("b", in_scan=False, stage="decoding", reason="b.png: is black\n    cause:  dark\n    remedy: light"),
-        _frame("c", decode_rate=0.9, mask_share=0.01, degeneracies=("all points lie in one plane",)),
-        _frame("d", decode_rate=0.9, mask_share=0.5, fitness=0.4),
-        _frame("e", decode_rate=0.9, shared_decoded=0.5),
-        _frame("f", decode_rate=0.1, shared_decoded=0.9),  # background that no frame decoded
+        FrameRecord("a", decode_rate=0.3, mask_share=0.4, fitness=0.95),
+        FrameRecord(
+            "b", in_scan=False, stage="decoding", reason="b.png: is black\n    cause:  dark\n    remedy: light"
+        ),
+        FrameRecord("c", decode_rate=0.9, mask_share=0.01, degeneracies=("all points lie in one plane",)),
+        FrameRecord("d", decode_rate=0.9, mask_share=0.5, fitness=0.4),
+        FrameRecord("e", decode_rate=0.9, shared_decoded=0.5),
+        FrameRecord("f", decode_rate=0.1, shared_decoded=0.9),  # background that no frame decoded
     ]
     said = what_to_recapture(frames, [_edge("a", "c"), _edge("c", "d", used=False)], ordered=True)
     assert said[0] == "b: capture it again; it was left out (b.png: is black)"
@@ -230,7 +204,7 @@ def test_every_reason_is_named():
 
 
 def test_unordered_frames_with_a_single_connection():
-    frames = [_frame(n) for n in "abcd"]
+    frames = [FrameRecord(n) for n in "abcd"]
     edges = [_edge("a", "b"), _edge("b", "c"), _edge("c", "a"), _edge("c", "d")]
     said = what_to_recapture(frames, edges, ordered=False)
     assert said == ("near d: add a frame; only one other frame overlaps it",)
@@ -238,9 +212,10 @@ def test_unordered_frames_with_a_single_connection():
 
 def test_frames_of_one_group_share_a_sentence():
     apart = {"in_scan": False, "stage": "registering", "reason": "it may slip\n    cause:  round"}
-    frames = [_frame("a", component=0), _frame("b", **apart, component=2), _frame("c", **apart, component=-1),
-              _frame("d", **apart, component=2), _frame("e", component=0),
-              _frame("f", **{**apart, "reason": "it is dark"}), _frame("g", **apart)]  # fmt: skip
+    kinds = {"a": {"component": 0}, "b": {**apart, "component": 2}, "c": {**apart, "component": -1},
+             "d": {**apart, "component": 2}, "e": {"component": 0}, "f": {**apart, "reason": "it is dark"},
+             "g": apart}  # fmt: skip
+    frames = [FrameRecord(name, **values) for name, values in kinds.items()]
     assert what_to_recapture(frames, [_edge("a", "e")], ordered=True) == (
         "b, d: capture views that connect this group 2 with the scan; b was left out (it may slip)",
         "c, g: capture them again; each was left out (it may slip)",
@@ -260,7 +235,7 @@ def test_the_figures_that_a_frame_has_fit_their_sentences():
     assert {"pure rotation", "planar", "epipole in view"} <= kinds
 
 
-def test_a_baseline_is_stated_by_the_name_of_its_frame():
+def test_a_baseline_is_stated_by_the_name_of_itsFrameRecord():
     found = stated_scale(KnownLength(0.085, "mm", ("IMG 7",)))
     assert found == Scale(True, "baseline of frame IMG 7", baseline_of="IMG 7")
 

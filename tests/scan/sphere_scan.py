@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy import ndarray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from sl_nerfstudio.errors import Fault
 from sl_nerfstudio.geometry.devices import Device
@@ -47,16 +47,14 @@ def correspondences(T_world_camera: ndarray, T_world_projector: ndarray) -> ndar
 
 def look_up(pattern: ndarray, coords: ndarray) -> ndarray:
     """The pattern at the coordinates, 10 where there are none."""
-    from scipy.ndimage import map_coordinates
-
     known = np.isfinite(coords[..., 0])
     uv = np.where(known[..., None], coords, 0)
     values = map_coordinates(pattern.astype(float), [uv[..., 1] - 0.5, uv[..., 0] - 0.5], order=1, mode="nearest")
     return np.where(known, values, 10).round().astype(np.uint8)
 
 
-def write_sphere(root: Path, frames: int = len(NAMES), **settings: Any) -> Path:
-    """Write a valid scan; `settings` replace those of ScanWriter."""
+def write_sphere(root: Path, frames: int = len(NAMES), color: ndarray | None = None, **settings: Any) -> Path:
+    """Write a valid scan; `color` is the picture of every frame, `settings` replace those of ScanWriter."""
     pattern = pattern_image()
     given = {"units": "mm", "scale": Scale(False), "projector": PROJECTOR, "pattern": pattern, "camera": CAMERA}
     with ScanWriter(root, **{**given, **settings}) as writer:
@@ -64,14 +62,9 @@ def write_sphere(root: Path, frames: int = len(NAMES), **settings: Any) -> Path:
             coords = correspondences(T_world_camera, T_world_projector)
             seen = look_up(pattern, coords)
             writer.add_frame(
-                f"frame_{i:05d}",
-                image=seen // 2 + 5,
-                coords=coords,
-                pattern=seen,
-                mask=np.isfinite(coords[..., 0]),
-                T_world_camera=T_world_camera,
-                T_world_projector=T_world_projector,
-            )
+                f"frame_{i:05d}", image=seen // 2 + 5, coords=coords, pattern=seen, mask=np.isfinite(coords[..., 0]),
+                color=color, T_world_camera=T_world_camera, T_world_projector=T_world_projector,
+            )  # fmt: skip
     return root
 
 

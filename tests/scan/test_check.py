@@ -87,9 +87,7 @@ def test_plain_npy_any_order_any_byte_order(tmp_path):
         (tmp_path / "a.npy").write_bytes(npy(variant))
         assert read_coords_size(tmp_path / "a.npy") == (CAMERA.w, CAMERA.h)
         found = read_coords(tmp_path / "a.npy")
-        assert found.dtype == np.float32
-        assert np.array_equal(found, coords)
-        assert found.flags.c_contiguous
+        assert found.dtype == np.float32 and found.flags.c_contiguous and np.array_equal(found, coords)
     (tmp_path / "a.npy").write_bytes(npy(np.array([Mine()], dtype=object), allow_pickle=True))
     with pytest.raises(FileError, match="holds pickled Python objects, which are never loaded"):
         read_coords(tmp_path / "a.npy")
@@ -98,12 +96,8 @@ def test_plain_npy_any_order_any_byte_order(tmp_path):
         read_coords(tmp_path / "a.txt")
 
 
-def placed(value, rows=8):
-    def change(coords):
-        coords[:rows] = value
-        return coords
-
-    return change
+def placed(value):
+    return lambda coords: np.concatenate([np.full_like(coords[:8], value), coords[8:]])
 
 
 def scale(x, y):
@@ -117,6 +111,11 @@ def one_pixel(value):
         return coords
 
     return change
+
+
+def exchange(coords):
+    """Of an oblong pattern."""
+    return np.ascontiguousarray(coords[..., ::-1]) + np.array([0, 40], np.float32)
 
 
 def lose_x(coords):
@@ -138,6 +137,7 @@ def lose_x(coords):
         (np.floor, "holds whole numbers only", "Gray-code", "add 0.5"),
         (scale(1 / PROJECTOR.w, 1 / PROJECTOR.h), "lies between -1 and 1", "normalised", "multiply"),
         (scale(4, 4), "outside the pattern", "another size", "pixels of pattern.png"),
+        (exchange, "outside the pattern", "x and y are swapped", "pixels of pattern.png"),
         (one_pixel(-9999), "puts 1 pixel outside the pattern", "marker", "NaN where not decoded"),
         (one_pixel(1e30), "puts 1 pixel outside the pattern", "diverged", "NaN where not decoded"),
     ],
@@ -146,19 +146,7 @@ def test_coordinates(sphere, change, problem, cause, remedy):
     edit_coords(sphere, NAME, change)
     fault = only_fault(sphere)
     assert (fault.file, fault.frame) == (COORDS, NAME)
-    assert problem in fault.problem
-    assert cause in fault.cause
-    assert remedy in fault.remedy
-
-
-def test_swapped_coordinates_on_an_oblong_pattern(sphere):
-    def exchange(coords):
-        return np.ascontiguousarray(coords[..., ::-1]) + np.array([0, 40], np.float32)
-
-    edit_coords(sphere, NAME, exchange)
-    fault = only_fault(sphere)
-    assert "outside the pattern" in fault.problem
-    assert "x and y are swapped" in fault.cause
+    assert problem in fault.problem and cause in fault.cause and remedy in fault.remedy
 
 
 def test_a_few_wrong_decodings_outside_the_pattern_are_no_fault(sphere):
@@ -172,16 +160,17 @@ def test_a_few_wrong_decodings_outside_the_pattern_are_no_fault(sphere):
     assert check_scan(sphere) == []
 
 
-def test_coordinates_half_a_pixel_off_are_seen_in_the_pattern(tmp_path):
-    root = write_sphere(tmp_path / "scan")
-    for sign, words in ((-0.5, ("OpenCV", "add 0.5 to")), (1.0, ("half a pixel was added", "subtract 0.5 from"))):
-        for name in NAMES:
-            edit_coords(root, name, lambda coords, sign=sign: coords + np.float32(sign))
-        fault = only_fault(root)
-        assert (fault.file, fault.frame, fault.field) == ("transforms.json", None, "sl_coords_path")
-        assert fault.problem == "are shifted relative to the pattern by half a pixel in x and y, in 4 of 4 frames"
-        assert words[0] in fault.cause
-        assert words[1] in fault.remedy
+@pytest.mark.parametrize(
+    ("shift", "cause", "remedy"),
+    [(-0.5, "OpenCV", "add 0.5 to"), (0.5, "half a pixel was added", "subtract 0.5 from")],
+)
+def test_coordinates_half_a_pixel_off_are_seen_in_the_pattern(sphere, shift, cause, remedy):
+    for name in NAMES:
+        edit_coords(sphere, name, lambda coords: coords + np.float32(shift))
+    fault = only_fault(sphere)
+    assert (fault.file, fault.frame, fault.field) == ("transforms.json", None, "sl_coords_path")
+    assert fault.problem == "are shifted relative to the pattern by half a pixel in x and y, in 4 of 4 frames"
+    assert cause in fault.cause and remedy in fault.remedy
 
 
 def test_no_shift_is_seen_where_there_is_none_nor_in_one_frame_alone(sphere):
@@ -206,8 +195,7 @@ def test_masks(sphere, change, problem, remedy):
     Image.fromarray(change(np.array(Image.open(path)))).save(path)
     fault = only_fault(sphere)
     assert (fault.file, fault.frame) == (f"masks/{NAME}.png", NAME)
-    assert fault.problem == problem
-    assert remedy in fault.remedy
+    assert fault.problem == problem and remedy in fault.remedy
 
 
 def test_a_mask_of_255_everywhere_and_none_at_all_are_no_faults(sphere):
@@ -257,9 +245,8 @@ def test_a_frame_copied_under_another_name(sphere):
 def test_doe_coordinates_beyond_the_horizon(tmp_path):
     steep = Device(PROJECTOR.w, PROJECTOR.h, 15.0, 15.0, 60.0, 45.0, model="DOE")
     root = write_sphere(tmp_path / "scan", projector=steep)
-    faults = [fault for fault in check_scan(root) if fault.file.startswith("coords/")]
-    assert len(faults) == len(NAMES)
-    assert all("pixels more than 90 degrees from the axis" in fault.problem for fault in faults)
+    said = [fault.problem for fault in check_scan(root) if fault.file.startswith("coords/")]
+    assert ["pixels more than 90 degrees from the axis" in problem for problem in said] == [True] * len(NAMES)
 
 
 def test_faults_come_in_the_order_of_the_frames_however_many_threads_there_are(sphere):

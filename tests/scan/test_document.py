@@ -36,9 +36,7 @@ def test_a_valid_scan_has_no_faults(sphere):
 def test_unreadable_text(sphere, content, problem, cause):
     (sphere / "transforms.json").write_bytes(content)
     fault = only_fault(sphere)
-    assert fault.file == "transforms.json"
-    assert problem in fault.problem
-    assert cause in fault.cause
+    assert fault.file == "transforms.json" and problem in fault.problem and cause in fault.cause
 
 
 def test_missing_folder_file_for_folder_and_missing_transforms(tmp_path):
@@ -126,6 +124,8 @@ def set_key(key, value):
         ("projector.fl_y", "12", "is '12' instead of a number"),
         ("w", 72.5, "is 72.5, not a whole number greater than 0"),
         ("h", -60, "is -60, not a whole number greater than 0"),
+        ("cx", 1e6, "is 1e+06, far outside an image of 72 pixels"),
+        ("projector.cy", -1e9, "is -1e+09, far outside an image of 96 pixels"),
         ("k3", 0.1, "is not 0"),
         ("frames", KeyError, "is missing or is not a list"),
         ("frames", {"0": 1}, "is missing or is not a list"),
@@ -141,8 +141,7 @@ def test_wrong_or_missing_values(sphere, key, value, problem):
     faults = check_scan(sphere)
     expected = f"{key}.camera_rotation_deg" if key == "sl_pose_sigma" else key
     assert (faults[0].file, faults[0].field or "frames") == ("transforms.json", expected)
-    assert problem in faults[0].problem
-    assert faults[0].cause and faults[0].remedy
+    assert problem in faults[0].problem and faults[0].cause and faults[0].remedy
     assert len(faults) == (3 if key == "sl_pose_sigma" else 1)
 
 

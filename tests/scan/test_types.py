@@ -131,7 +131,18 @@ def test_a_sentence_is_not_read_where_data_say_otherwise_or_nothing_is_known(sph
 
 
 END = {"frame": NAMES[0], "pixel": [30.0, 30.0]}
-OTHER = {"frame": NAMES[1], "pixel": [30.0, 30.0]}
+
+
+def at(*pixel):
+    return {"frame": NAMES[1], "pixel": [*pixel]}
+
+
+OTHER = at(30.0, 30.0)
+OUTSIDE = f"has the pixel (30, 61), outside the {CAMERA.w} x {CAMERA.h} pixels of frame {NAMES[1]!r}"
+
+
+def bar(other=OTHER, length=5.0):
+    return {"distance_between": [END, other], "length": length}
 
 
 @pytest.mark.parametrize(
@@ -139,28 +150,20 @@ OTHER = {"frame": NAMES[1], "pixel": [30.0, 30.0]}
     [
         ({"baseline_of": 3}, "baseline_of", "is 3 instead of a text"),
         ({"known": False, "baseline_of": NAMES[0]}, "known", "is false, although a known length is given"),
-        (
-            {"baseline_of": NAMES[0], "distance_between": [END, OTHER], "length": 3},
-            "baseline_of",
-            "is given together with distance_between",
-        ),
+        ({**bar(), "baseline_of": NAMES[0]}, "baseline_of", "is given together with distance_between"),
         ({"distance_between": [END, OTHER]}, "length", "is missing"),
         ({"length": 5.0}, "distance_between", "is missing"),
-        ({"distance_between": [END, OTHER], "length": 0}, "length", "is 0"),
-        ({"distance_between": [END, OTHER], "length": "5 mm"}, "length", "is '5 mm' instead of a number"),
+        (bar(length=0), "length", "is 0"),
+        (bar(length="5 mm"), "length", "is '5 mm' instead of a number"),
         ({"distance_between": [END], "length": 5}, "distance_between", "is not a list of two pixels"),
-        ({"distance_between": [END, END], "length": 5}, "distance_between", "is twice the same pixel"),
-        ({"distance_between": [END, 7], "length": 5}, "distance_between[1]", "is not an object { .. }"),
-        ({"distance_between": [END, {"frame": NAMES[1]}], "length": 5}, "distance_between[1].pixel", "is missing"),
+        (bar(END), "distance_between", "is twice the same pixel"),
+        (bar(7), "distance_between[1]", "is not an object { .. }"),
+        (bar({"frame": NAMES[1]}), "distance_between[1].pixel", "is missing"),
+        (bar(at(1, 2, 3)), "distance_between[1].pixel", "is [1, 2, 3] instead of a list of 2 numbers"),
         (
-            {"distance_between": [{**END, "pixel": [1, 2, 3]}, OTHER], "length": 5},
-            "distance_between[0].pixel",
-            "is [1, 2, 3] instead of a list of 2 numbers",
-        ),
-        (
-            {"distance_between": [END, {**OTHER, "pixel": [30, 61]}], "length": 5},
+            bar(at(30, 61)),
             "distance_between",
-            f"has the pixel (30, 61), outside the {CAMERA.w} x {CAMERA.h} pixels of frame {NAMES[1]!r}",
+            f"has the pixel (30, 61), outside the 72 x 60 pixels of frame {NAMES[1]!r}",
         ),
         ({"baseline_off": NAMES[0]}, "baseline_off", "is not a key of a scan"),
     ],
@@ -169,13 +172,11 @@ def test_a_faulty_known_length_is_named(sphere, scale, field, problem):
     edit(sphere, with_scale({"known": True, **scale}))
     fault = only_fault(sphere)
     assert (fault.file, fault.frame, fault.field) == ("transforms.json", None, f"scale.{field}")
-    assert fault.problem == problem
-    assert fault.cause and fault.remedy
+    assert fault.problem == problem and fault.cause and fault.remedy
 
 
 def test_a_bar_where_nothing_was_decoded_is_found_by_the_full_check(sphere):
-    ends = [END, {"frame": NAMES[1], "pixel": [1.5, 2.5]}]
-    edit(sphere, with_scale({"known": True, "distance_between": ends, "length": 5}))
+    edit(sphere, with_scale({"known": True, **bar(at(1.5, 2.5))}))
     fault = only_fault(sphere)
     assert (fault.frame, fault.field) == (NAMES[1], "scale.distance_between")
     assert fault.problem == "has no decoded coordinates within 3 pixels of (1.5, 2.5)"
