@@ -4,6 +4,7 @@ import os
 import shlex
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -415,17 +416,26 @@ _MAY_BE_COLOUR = ("file_path", "sl_color_path")
 
 def check_headers(partial: PartialScan, faults: Faults) -> set[Path]:
     """Check the headers of all files; return the files that can be decoded."""
-    files = [(None, "pattern_path", partial.pattern_path, partial.projector)]
-    files += [(frame.name, key, frame.paths.get(key), frame.camera) for frame in partial.frames for key in _CHECKED]
+    files = [(None, "pattern_path", partial.pattern_path, _size_of(partial.projector), "the projector has")]
+    for frame in partial.frames:
+        size, whose = _size_of(frame.camera), "the camera has"
+        if size is None and (coords := frame.paths.get("sl_coords_path")) is not None:
+            with suppress(FileError):
+                size, whose = read_coords_size(coords), "its coordinates are"
+        files += [(frame.name, key, frame.paths.get(key), size, whose) for key in _CHECKED]
     good: set[Path] = set()
-    for frame, key, path, device in files:
+    for frame_name, key, path, size, whose in files:
         if path is not None:
-            problems = list(_header_problems(key, path, device))
+            problems = list(_header_problems(key, path, size, whose))
             for problem in problems:
-                faults.add(problem, relative(path, partial.root), frame)
+                faults.add(problem, relative(path, partial.root), frame_name)
             if not problems:
                 good.add(path)
     return good
+
+
+def _size_of(device: Device | None) -> tuple[int, int] | None:
+    return None if device is None else (device.w, device.h)
 
 
 def relative(path: Path, root: Path) -> str:
@@ -433,21 +443,21 @@ def relative(path: Path, root: Path) -> str:
     return path.relative_to(root).as_posix()
 
 
-def _header_problems(key: str, path: Path, device: Device | None) -> Iterator[Problem | FileError]:
-    """What is wrong with a file by its header; `device` has the size that it must have, None if that is not known."""
+def _header_problems(key: str, path: Path, wanted: tuple[int, int] | None, whose: str) -> Iterator[Problem | FileError]:
+    """What is wrong with a file by its header; `wanted`: the size that it must have, None if that is not known."""
     try:
         header = None if key == "sl_coords_path" else read_header(path)
         size = read_coords_size(path) if header is None else (header.w, header.h)
     except FileError as error:
         yield error
         return
-    if device is not None and size != (device.w, device.h):
-        yield _wrong_size(size, (device.w, device.h), "the projector" if key == "pattern_path" else "the camera")
+    if wanted is not None and size != wanted:
+        yield _wrong_size(size, wanted, whose)
     if header is not None and header.mode != "grey" and key not in _MAY_BE_COLOUR:
         yield Problem("is in colour", "it was saved by a program that writes only RGB", "save it as grey, 8 or 16 bit")
 
 
-def _wrong_size(found: tuple[int, int], wanted: tuple[int, int], device: str) -> Problem:
+def _wrong_size(found: tuple[int, int], wanted: tuple[int, int], whose: str) -> Problem:
     if found == wanted[::-1]:
         cause = "width and height are swapped: the image was rotated, or w and h were swapped"
     elif found[0] * wanted[1] == found[1] * wanted[0]:
@@ -455,7 +465,7 @@ def _wrong_size(found: tuple[int, int], wanted: tuple[int, int], device: str) ->
     else:
         cause = "it was cropped, or comes from another camera or scan"
     return Problem(
-        f"is {found[0]} x {found[1]} pixels, but {device} has {wanted[0]} x {wanted[1]}",
+        f"is {found[0]} x {found[1]} pixels, but {whose} {wanted[0]} x {wanted[1]}",
         cause,
         "give the original file, or the intrinsics (w, h, fl_x, fl_y, cx, cy) of this one",
     )

@@ -198,6 +198,15 @@ def test_masks(sphere, change, problem, remedy):
     assert fault.problem == problem and remedy in fault.remedy
 
 
+def test_sizes_are_compared_with_the_coordinates_where_the_camera_is_not_known(sphere):
+    path = sphere / "masks" / f"{NAME}.png"
+    Image.new("L", (CAMERA.w, CAMERA.h + 3), 255).save(path)
+    edit(sphere, lambda document: document.update(fl_x=-1.0))
+    faults = check_scan(sphere)
+    assert [fault.field for fault in faults[:-1]] == ["fl_x"] and faults[-1].file == f"masks/{NAME}.png"
+    assert f"but its coordinates are {CAMERA.w} x {CAMERA.h}" in faults[-1].problem
+
+
 def test_a_mask_of_255_everywhere_and_none_at_all_are_no_faults(sphere):
     Image.new("L", (CAMERA.w, CAMERA.h), 255).save(sphere / "masks" / f"{NAME}.png")
     edit(sphere, lambda document: document["frames"][2].pop("mask_path"))
