@@ -1,7 +1,7 @@
 """The interface of an implementation of the field, and what the compiled one supports.
 
-An implementation evaluates the field inside and outside its box and pulls gradients back. It does not use autograd:
-`autograd.py` makes torch operations from it.
+An implementation evaluates the field inside and outside its box and pulls gradients back. It does not use autograd: the
+functions at the end make torch operations from it.
 """
 
 from dataclasses import dataclass
@@ -184,11 +184,6 @@ class FieldBackend(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Kept:
-    """What a `MergedBackend` keeps between an evaluation and its pull-back."""
-
-
 @runtime_checkable
 class MergedBackend(Protocol):
     """An implementation that evaluates all points together: values of all, gradients of those from `first` on.
@@ -198,14 +193,14 @@ class MergedBackend(Protocol):
 
     def evaluate_all(
         self, state: FieldState, p: Float[Tensor, "n 3"], first: int
-    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"], Kept]:
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"], Any]:
         """Values, gradients of the points from `first` on, and what the pull-back needs."""
         ...
 
     def pull_back_all(
         self,
         state: FieldState,
-        kept: Kept,
+        kept: Any,
         g: Float[Tensor, "n"],
         v: Float[Tensor, "k 3"],
         points: bool,
@@ -357,7 +352,7 @@ def value(
     If there is a `buffer`, it is or becomes the table's `.grad`, and `backward()` adds to it.
     """
     if isinstance(backend, MergedBackend):
-        return _apply_merged(backend, buffer, state, p, len(p))[0]
+        return _apply(_Merged, backend, buffer, state, p, len(p))[0]
     return _apply(_Value, backend, buffer, state, p)
 
 
@@ -366,7 +361,7 @@ def value_and_gradient(
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Values and gradients at `p`, both differentiable with respect to the parameters; `p` is a constant."""
     if isinstance(backend, MergedBackend):
-        return _apply_merged(backend, buffer, state, p.detach(), 0)
+        return _apply(_Merged, backend, buffer, state, p.detach(), 0)
     return _apply(_ValueAndGradient, backend, buffer, state, p.detach())
 
 
@@ -382,22 +377,14 @@ def value_and_last_gradients(
     Together, if the backend can, which saves launches on a GPU.
     """
     if isinstance(backend, MergedBackend):
-        return _apply_merged(backend, buffer, state, p, first)
+        return _apply(_Merged, backend, buffer, state, p, first)
     f, gradient = value_and_gradient(backend, buffer, state, p[first:])
     return torch.cat([value(backend, buffer, state, p[:first]), f]), gradient
 
 
-def _apply_merged(
-    backend: MergedBackend, buffer: TableGradient | None, state: FieldState, p: Tensor, first: int
-) -> tuple[Tensor, Tensor]:
-    p = p.to(state.table.dtype).contiguous()
-    with torch.autocast(p.device.type, enabled=False):
-        tensors = (p, state.places, state.level_weights, state.table, *state.mlp)
-        return _Merged.apply(backend, buffer, state.active, first, *tensors)
-
-
-def _apply(function: Any, backend: FieldBackend, buffer: TableGradient | None, state: FieldState, p: Tensor) -> Any:
+def _apply(function: Any, backend: Any, buffer: TableGradient | None, state: FieldState, p: Tensor, *first: int) -> Any:
     """Call an autograd function in the parameters' precision, even if mixed precision is switched on."""
     with torch.autocast(p.device.type, enabled=False):
-        tensors = (p.to(state.table.dtype), state.places, state.level_weights, state.table, *state.mlp)
-        return function.apply(backend, buffer, state.active, *tensors)
+        p = p.to(state.table.dtype).contiguous()
+        tensors = (p, state.places, state.level_weights, state.table, *state.mlp)
+        return function.apply(backend, buffer, state.active, *first, *tensors)

@@ -84,12 +84,6 @@ class Scratch(NamedTuple):
     """Derivative of f with respect to the encoded points."""
 
 
-def make_scratch(depth: int, hidden: int, layers: int) -> Scratch:
-    """Buffers for a network of these sizes."""
-    width = {"e": depth, "e_dot": depth, "de": depth, "ue": depth, "jac": 3 * depth, "d": hidden, "d2": hidden}
-    return Scratch(**{k: np.zeros(POINTS * width.get(k, layers * hidden), np.float32) for k in Scratch._fields})
-
-
 @part
 def slope(t):
     """Derivative of the activation."""
@@ -411,11 +405,6 @@ def pack_network(layout: GridLayout, state: FieldState, knee: float) -> Network:
     )
 
 
-def zero_gradients(network: Network) -> Weights:
-    """Gradients of the MLP, initially zero, for kernels to add to."""
-    return Weights(*(np.zeros_like(w) for w in network.weights))
-
-
 def unpack_gradients(
     layout: GridLayout, state: FieldState, network: Network, parts: list[Weights]
 ) -> tuple[Tensor, ...]:
@@ -483,21 +472,8 @@ class NumbaField:
         dp = np.empty((len(xyz) if points else 0, 3), np.float32)
 
         def work(sums: Weights, levels: np.ndarray, _: np.ndarray, offset: int, start: int, stop: int) -> None:
-            pull_back_fused(
-                grid,
-                network,
-                _scratch(network),
-                xyz,
-                start,
-                stop,
-                upstream,
-                sums,
-                levels,
-                offset,
-                parameters,
-                dp,
-                points,
-            )
+            outputs = (sums, levels, offset, parameters, dp, points)
+            pull_back_fused(grid, network, _scratch(network), xyz, start, stop, upstream, *outputs)
 
         parts = self._sweep(grid, network, xyz, None, parameters, table_gradient, marks, work)
         mlp = unpack_gradients(self.layout, state, network, parts) if parameters else None
@@ -545,32 +521,24 @@ class NumbaField:
         """
         batch = min(len(xyz), _BATCH)
         ranges = _ranges(batch)
-        sums = [zero_gradients(network) for _ in ranges]
+        sums = [Weights(*map(np.zeros_like, network.weights)) for _ in ranges]
         levels = np.empty((self.layout.levels, batch if parameters else 0, FEATURES), np.float32)
         slopes = np.empty((self.layout.levels, 0 if direction is None else batch, FEATURES), np.float32)
         v = xyz if direction is None else direction
         on = [level for level in reversed(range(self.layout.levels)) if grid.weights[level]]
         for first in range(0, len(xyz), _BATCH):
             count = min(_BATCH, len(xyz) - first)
-            parallel(
-                [
-                    partial(work, part, levels, slopes, first, first + start, first + min(stop, count))
-                    for (start, stop), part in zip(ranges, sums, strict=True)
-                ]
-            )
+            of_ranges = [
+                partial(work, part, levels, slopes, first, first + start, first + min(stop, count))
+                for (start, stop), part in zip(ranges, sums, strict=True)
+            ]
+            parallel(of_ranges)
             if table_gradient is None:
                 continue
             gradient = table_gradient.numpy().reshape(-1)
             touched = np.empty(self.layout.rows, np.uint8) if marks is None else marks.numpy()
-            parallel(
-                [
-                    partial(
-                        scatter_level,
-                        *(grid, level, xyz, first, count, levels, gradient, touched, v, slopes, direction is not None),
-                    )
-                    for level in on
-                ]
-            )
+            arrays = (xyz, first, count, levels, gradient, touched, v, slopes, direction is not None)
+            parallel([partial(scatter_level, grid, level, *arrays) for level in on])
         return sums
 
 
@@ -591,9 +559,11 @@ def _heavy(g: Float[Tensor, "n"]) -> Tensor | None:
 
 def _scratch(network: Network) -> Scratch:
     """This thread's buffers."""
-    sizes = (network.depth, network.hidden, network.layers)
+    depth, hidden, layers = sizes = (network.depth, network.hidden, network.layers)
     if getattr(_buffers, "sizes", None) != sizes:
-        _buffers.sizes, _buffers.scratch = sizes, make_scratch(*sizes)
+        width = {"e": depth, "e_dot": depth, "de": depth, "ue": depth, "jac": 3 * depth, "d": hidden, "d2": hidden}
+        arrays = {k: np.zeros(POINTS * width.get(k, layers * hidden), np.float32) for k in Scratch._fields}
+        _buffers.sizes, _buffers.scratch = sizes, Scratch(**arrays)
     return _buffers.scratch
 
 

@@ -19,7 +19,7 @@ import triton.language as tl
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from sl_nerfstudio.field.backend import FieldState, Kept, Pulled
+from sl_nerfstudio.field.backend import FieldState, Pulled
 from sl_nerfstudio.field.device_kernels import block, launch
 from sl_nerfstudio.field.hash_grid import FEATURES, PRIMES, GridLayout
 from sl_nerfstudio.field.triton_vectors import clamped, dot, length, minus, one_minus_exp, store, vector
@@ -277,7 +277,7 @@ def row_adam(
 
 
 @dataclass(frozen=True)
-class _Kept(Kept):
+class _Kept:
     """Of n points, k of them with gradients; h is the width of a hidden layer.
 
     Rows of values come first, then k rows for derivatives, which the pull-back fills where an evaluation does not.
@@ -331,7 +331,7 @@ class TritonField:
     def pull_back_all(
         self,
         state: FieldState,
-        kept: Kept,
+        kept: _Kept,
         g: Float[Tensor, "n"],
         v: Float[Tensor, "k 3"],
         points: bool,
@@ -340,7 +340,6 @@ class TritonField:
         marks: UInt8[Tensor, "marks"] | None,
     ) -> Pulled:
         """See `MergedBackend`."""
-        assert isinstance(kept, _Kept)
         p, first, n, k, z = kept.p, kept.first, len(kept.p), len(kept.p) - kept.first, kept.z
         weights, _ = _layers(state)
         last = len(z) - 1

@@ -320,7 +320,7 @@ class SLModel(Model):
         c = self.config
         self.step_now.fill_(step)
         self._set_scalars(step)
-        self.field.set_level_weights(level_weights_at(c.annealing, c.sdf.levels, step, c.schedule_iterations))
+        self.field.encoding.set_level_weights(level_weights_at(c.annealing, c.sdf.levels, step, c.schedule_iterations))
 
     def _set_scalars(self, step: int) -> None:
         """What steps read on their device, and what the host knows of it."""

@@ -33,6 +33,7 @@ class MergedField(Protocol):
         self, p: Float[Tensor, "n 3"], first: int
     ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"]]:
         """See `SDFField`."""
+        ...
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ def gradients(field: SDFField) -> list[Tensor]:
 def reference(p: Tensor, g: Tensor, v: Tensor | None, hidden: int) -> tuple[list[Tensor], list[Tensor]]:
     """Values (f, df/dp) and parameter gradients of `g f + v . grad f`, by torch's double backward in float64."""
     field = make_field("torch", torch.float64, hidden=hidden)
-    field.set_level_weights(WEIGHTS.double())
+    field.encoding.set_level_weights(WEIGHTS.double())
     p = p.clone().requires_grad_()
     f = plain_sdf(field, p)
     (n,) = torch.autograd.grad(f.sum(), p, create_graph=True)
@@ -43,7 +43,7 @@ def test_values_and_derivatives_are_those_of_double_backward(
     v = torch.randn(300, 3).double() if of_gradients else None
     (f_true, n_true), parameters_true = reference(p, g, v, hidden)
     field = make_field(backend, dtype, hidden=hidden)
-    field.set_level_weights(WEIGHTS.to(dtype))
+    field.encoding.set_level_weights(WEIGHTS.to(dtype))
     q = p.to(dtype).requires_grad_()
     if v is None:
         f = field.sdf(q)
@@ -218,7 +218,7 @@ def test_a_parameter_changed_between_forward_and_backward_is_detected() -> None:
 
 def test_state_dict_and_copies_carry_the_whole_field() -> None:
     field, p = make_field("numba"), points_around(50).float()
-    field.set_level_weights(WEIGHTS)
+    field.encoding.set_level_weights(WEIGHTS)
     field.sdf(p).sum().backward()
     other = make_field("torch", seed=5)
     other.load_state_dict(field.state_dict())
