@@ -43,7 +43,6 @@ from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import BLOCK, PixelBatch, PixelSamples
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, log_se3
-from sl_nerfstudio.geometry.numerics import evenly_spaced
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan import Scan, measured_length
 
@@ -231,9 +230,7 @@ def maps_and_held_out(scan: Scan, samples: PixelSamples) -> tuple[CoordinateMaps
     """Coordinate images without the held-out pixels, and a selection of the held-out pixels."""
     frames, uv_camera, uv_projector, blocks = [], [], [], []
     for number, frame in enumerate(scan.frames):
-        index = samples.held_out_of(number)
-        count = min(len(index), HELD_OUT_PER_FRAME)
-        test = samples.at(index[torch.from_numpy(evenly_spaced(len(index), count))])
+        test = samples.held_out_of(number, HELD_OUT_PER_FRAME)
         decoded = test.decoded
         frames.append(test.frame[decoded])
         uv_camera.append(test.uv[decoded].double())

@@ -106,7 +106,8 @@ class SLTrainerConfig(TrainerConfig):
         with phase("check") as check:
             require_valid(root)
             frames = len(load_scan(root).scan.frames)
-            check.say(f"{short_path(root)}: {frames} frames, no faults{_resumed(begun)}")
+            resumed = "" if begun is None else f"; goes on after step {begun.step} of {short_path(begun.path)}"
+            check.say(f"{short_path(root)}: {frames} frames, no faults{resumed}")
         pipeline: SLPipelineConfig = self.pipeline  # type: ignore[assignment]
         pipeline.scan_fingerprint = load_scan(root).fingerprint
         if begun is not None:
@@ -258,10 +259,6 @@ def _intrinsics_change(
         found = refine_intrinsics(loaded, stated, model.refine_poses, model.prior, model.adjustment)
         shown.say(refined_intrinsics_message(found, cameras, loaded.scan.projector))
     return found.change
-
-
-def _resumed(begun: Checkpoint | None) -> str:
-    return "" if begun is None else f"; goes on after step {begun.step} of {short_path(begun.path)}"
 
 
 def _with_length(scheduler: SchedulerConfig | None, steps: int) -> SchedulerConfig | None:

@@ -111,7 +111,7 @@ class DecodingNoise:
     """How well coordinates are decoded, and how pattern pixels relate to lengths."""
 
     px: Float[Tensor, ""] | float  # 1 sigma of the epipolar residual, pattern pixels
-    px_per_length: Float[Tensor, ""] | float  # median slope of coordinates along camera rays, per scene unit
+    px_per_length: Float[Tensor, ""] | float  # median slope along camera rays, pattern pixels per scene unit
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
@@ -230,9 +229,3 @@ def test_a_change_in_percent_or_pixels_is_rejected(tiny_root: Path, which: int, 
     a, b, c, d, e, f = (value if which == k else 0.0 for k in range(6))
     with pytest.raises(UserError, match=r"(?s)intrinsics_change \(.*give shares of the focal length"):
         manager(tiny_root, dataparser=SLDataParserConfig(intrinsics_change=IntrinsicsChange.of((a, b, c, d, e, f))))
-
-
-def test_other_dataparsers_are_rejected(tiny_root: Path) -> None:
-    config = SLDataManagerConfig(data=tiny_root, dataparser=NerfstudioDataParserConfig())
-    with pytest.raises(UserError, match="NerfstudioDataParserConfig does not describe a projector"):
-        config.setup(device="cpu")

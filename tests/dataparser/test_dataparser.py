@@ -112,10 +112,11 @@ def test_held_out_draws_and_held_out_of_a_frame(samples: PixelSamples) -> None:
     drawn = samples.draw(5000, torch.Generator().manual_seed(1), held_out=True)
     assert samples.held_out[drawn].all()
     assert set(drawn.tolist()) == set(samples.held_out.nonzero()[:, 0].tolist())
-    parts = [samples.held_out_of(i) for i in range(3)]
-    assert torch.equal(torch.cat(parts), samples.held_out.nonzero()[:, 0])
-    for number, part in enumerate(parts):
-        assert (samples.frame[part] == number).all()
+    whole = samples.at(samples.held_out_index)
+    for number in range(3):
+        part, own = samples.held_out_of(number, 10**6), whole.frame == number
+        assert torch.equal(part.row, whole.row[own]) and torch.equal(part.column, whole.column[own])
+        assert (part.frame == number).all() and len(samples.held_out_of(number, 5).row) == min(len(part.row), 5)
 
 
 def test_without_mask_files_the_decoded_pixels_count(tmp_path: Path) -> None:
