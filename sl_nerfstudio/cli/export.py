@@ -3,11 +3,11 @@
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sl_nerfstudio.cli.arguments import CONFIG, SCAN, flag_name, parse
+from sl_nerfstudio.cli.arguments import CONFIG, SCAN, given_flags, parse
 from sl_nerfstudio.cli.run import load_run, run
 from sl_nerfstudio.console import command, fitted, next_steps, phase, short_path, unit_word
 from sl_nerfstudio.errors import UserError
@@ -78,18 +78,6 @@ class ExportConfig:
         """The files with the refined poses and with the training, if they are to be written."""
         folder = self.pose_folder
         return () if folder is None else (folder / "transforms.json", folder / "training.json")
-
-    def words(self) -> list[str]:
-        """The flags that give this configuration, for a command to copy."""
-        words: list[str] = []
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.default is not MISSING and value == field.default:
-                continue
-            words.append(flag_name(field.name))
-            if not isinstance(value, bool):
-                words += map(str, value if isinstance(value, tuple) else (value,))
-        return words
 
     def settings(self, units: str) -> "ExportSettings":
         """The export that is asked for, of a scan whose lengths are in `units`."""
@@ -299,7 +287,7 @@ def _next(config: ExportConfig, scan: "Scan", exported: "Exported") -> list[str]
     steps, poses = [], config.pose_files[:1]
     if exported.poses_refined and not poses:
         again = replace(config, poses=_new_folder(config.output), overwrite=True)
-        steps.append(command("sl-export", *again.words()))
+        steps.append(command("sl-export", *given_flags(again)))
         poses = again.pose_files[:1]
     given = ("--mesh", config.output, "--data", short_path(scan.root), *(("--poses", poses[0]) if poses else ()))
     return [next_steps([*steps, command("sl-eval", *given, "--report", "report.html")])]
@@ -340,19 +328,20 @@ def _removed(surface: "ExtractedSurface") -> list[str]:
     trimmed = surface.trimmed
     if trimmed is None:
         return ["  nothing was removed: parts that no frame observed are invented by the field"]
-    gone = [
-        f"{count:,} {what}"
-        for count, what in (
-            (trimmed.unseen, "vertices that no frame saw"),
-            (trimmed.contradicted, "that frames contradict"),
-            (trimmed.loose_pieces, "loose piece" if trimmed.loose_pieces == 1 else "loose pieces"),
-        )
-        if count
-    ]
-    lines = [f"  removed, of {trimmed.total:,} vertices: {', '.join(gone) or 'nothing'} (--keep-unobserved keeps them)"]
+    gone = _counted(
+        (trimmed.unseen, "vertices that no frame saw"),
+        (trimmed.contradicted, "that frames contradict"),
+        (trimmed.loose_pieces, "loose piece" if trimmed.loose_pieces == 1 else "loose pieces"),
+    )
+    lines = [f"  removed, of {trimmed.total:,} vertices: {gone or 'nothing'} (--keep-unobserved keeps them)"]
     if trimmed.closed:
         lines.append(f"  kept, though no frame observed them: {trimmed.closed:,} vertices in small gaps")
     return [*lines, *_agreement(surface)]
+
+
+def _counted(*counts: tuple[int, str]) -> str:
+    """What there is of several things, but for those of which there is nothing."""
+    return ", ".join(f"{count:,} {what}" for count, what in counts if count)
 
 
 def _agreement(surface: "ExtractedSurface") -> list[str]:
@@ -374,12 +363,8 @@ def _filled(config: ExportConfig, surface: "ExtractedSurface", unit: str) -> lis
         f"  --fill-holes closed {filled.closed:,} holes of up to {limit} with the field's surface "
         f"({filled.area:.3g} square {unit})"
     ]
-    still = [
-        f"{count:,} {what}"
-        for count, what in ((filled.too_large, "that are larger"), (filled.denied, "that frames look through"))
-        if count
-    ]
-    return lines + ([f"    holes that stay open: {', '.join(still)}"] if still else [])
+    still = _counted((filled.too_large, "that are larger"), (filled.denied, "that frames look through"))
+    return lines + ([f"    holes that stay open: {still}"] if still else [])
 
 
 def _cut(config: ExportConfig, surface: "ExtractedSurface", unit: str) -> list[str]:
@@ -484,7 +469,9 @@ def _other_files(config: ExportConfig, scan: "Scan", exported: "Exported", unit:
     lines = []
     if config.points is not None:
         lines.append(f"{config.points}: {exported.points:,} points that frames confirm, with normals, sigma and views")
-        lines += _las_unit(config.points, scan.units)
+        if config.points.suffix.lower() == ".las":
+            arbitrary = "  one of the scan's arbitrary units became one metre"
+            lines.append(arbitrary if scan.units == "arbitrary" else "  written in metres")
     sigma = exported.pose_sigma
     if config.pose_files:
         known = ""
@@ -501,12 +488,6 @@ def _other_files(config: ExportConfig, scan: "Scan", exported: "Exported", unit:
     for kind, paths in config.settings(scan.units).device_files.items():
         lines += [f"{paths[0].parent}: {', '.join(path.name for path in paths)}", f"  {notes[kind]}"]
     return lines
-
-
-def _las_unit(path: Path, units: str) -> list[str]:
-    if path.suffix.lower() != ".las":
-        return []
-    return ["  one of the scan's arbitrary units became one metre" if units == "arbitrary" else "  written in metres"]
 
 
 def _rms(values: "ndarray") -> float:
