@@ -152,26 +152,6 @@ def test_two_processes_do_not_write_to_one_folder(tmp_path):
     RunFolder(folder).leave()
 
 
-@pytest.mark.parametrize(
-    "change, words",
-    [
-        (lambda config: setattr(config, "schedule_iterations", 0), "--schedule-iterations 0: at least 1"),
-        (lambda config: setattr(config.machine, "seed", -1), "--machine.seed -1: give a number from 0"),
-        (
-            lambda config: setattr(config.pipeline.datamanager, "train_num_rays_per_batch", 0),
-            "train-num-rays-per-batch 0",
-        ),
-        (lambda config: setattr(config, "timestamp", "../../../escaped"), "is not the name of a folder inside"),
-        (lambda config: setattr(config, "experiment_name", ""), "--experiment-name '': is not the name of a folder"),
-    ],
-)
-def test_numbers_and_names_that_no_training_can_have(scan_root, tmp_path, capfd, change, words):
-    config = settings(scan_root, tmp_path / "new")
-    change(config)
-    assert status(train, config) == 1
-    assert words in capfd.readouterr().err and not list(tmp_path.iterdir())
-
-
 @pytest.mark.parametrize("place", ["/proc/run", "/dev/null/run"])
 def test_a_place_that_cannot_be_written(place):
     with pytest.raises(UserError, match=r"cannot be written \((.|\n)*--output-dir"):
