@@ -233,15 +233,6 @@ def _place(path: Path, overwrite: bool) -> Iterator[str]:
         yield f"{path}: cannot be written, {folder} {problem}\n    remedy: choose another output"
 
 
-def require_other_files(paths: tuple[Path, ...], scan: Path) -> None:
-    """Raise UserError if poses would replace the scan's own."""
-    for path in paths:
-        if path.resolve() == (scan / path.name).resolve():
-            raise UserError(
-                f"{path}: is the scan's own file\n    remedy: give --poses another folder, such as refined/"
-            )
-
-
 # What sl-export prints: what was written, what was removed or invented, and what to do next.
 
 _SUSPICIOUS_PX = 3.0
@@ -523,7 +514,11 @@ def export_trained(trained: "TrainedRun", config: ExportConfig) -> "Exported":
     from sl_nerfstudio.runs.export import export_run
 
     scan = trained.model.scan
-    require_other_files(config.pose_files, scan.root)
+    for path in config.pose_files:
+        if path.resolve() == (scan.root / path.name).resolve():
+            raise UserError(
+                f"{path}: is the scan's own file\n    remedy: give --poses another folder, such as refined/"
+            )
     return export_run(trained, config.settings(scan.units))
 
 

@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.field.backend import FieldState, Pulled
+from sl_nerfstudio.field.backend import FieldState, Pulled, Target
 from sl_nerfstudio.field.hash_grid import FEATURES, GridLayout
 from sl_nerfstudio.field.numba_grid import FIRST, POINTS, GridArrays, clamped, encode, inside, scatter_level
 from sl_nerfstudio.field.simd import contract, kernel, multiply, part
@@ -457,14 +457,12 @@ class NumbaField:
         p: Float[Tensor, "n 3"],
         g: Float[Tensor, "n"],
         points: bool,
-        parameters: bool,
-        table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "marks"] | None,
+        to: Target,
     ) -> Pulled:
         """See `FieldBackend`; points whose `g` is negligible are left out."""
         heavy = _heavy(g)
         if heavy is not None:
-            some = self.pull_back(state, p[heavy], g[heavy], points, parameters, table_gradient, marks)
+            some = self.pull_back(state, p[heavy], g[heavy], points, to)
             dp = None if some.points is None else torch.zeros_like(p).index_copy_(0, heavy, some.points)
             return Pulled(dp, some.mlp)
         grid, network, xyz = self._packed(state, p)
@@ -472,11 +470,11 @@ class NumbaField:
         dp = np.empty((len(xyz) if points else 0, 3), np.float32)
 
         def work(sums: Weights, levels: np.ndarray, _: np.ndarray, offset: int, start: int, stop: int) -> None:
-            outputs = (sums, levels, offset, parameters, dp, points)
+            outputs = (sums, levels, offset, to.parameters, dp, points)
             pull_back_fused(grid, network, _scratch(network), xyz, start, stop, upstream, *outputs)
 
-        parts = self._sweep(grid, network, xyz, None, parameters, table_gradient, marks, work)
-        mlp = unpack_gradients(self.layout, state, network, parts) if parameters else None
+        parts = self._sweep(grid, network, xyz, None, to, work)
+        mlp = unpack_gradients(self.layout, state, network, parts) if to.parameters else None
         return Pulled(torch.from_numpy(dp) if points else None, mlp)
 
     def pull_back_gradient(
@@ -485,8 +483,7 @@ class NumbaField:
         p: Float[Tensor, "n 3"],
         g: Float[Tensor, "n"],
         v: Float[Tensor, "n 3"],
-        table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "marks"] | None,
+        to: Target,
     ) -> tuple[Tensor, ...]:
         """See `FieldBackend`."""
         grid, network, xyz = self._packed(state, p)
@@ -497,7 +494,7 @@ class NumbaField:
                 grid, network, _scratch(network), xyz, start, stop, upstream, direction, sums, levels, slopes, offset
             )
 
-        parts = self._sweep(grid, network, xyz, direction, True, table_gradient, marks, work)
+        parts = self._sweep(grid, network, xyz, direction, to, work)
         return unpack_gradients(self.layout, state, network, parts)
 
     def _packed(self, state: FieldState, p: Tensor) -> tuple[GridArrays, Network, np.ndarray]:
@@ -509,9 +506,7 @@ class NumbaField:
         network: Network,
         xyz: np.ndarray,
         direction: np.ndarray | None,
-        parameters: bool,
-        table_gradient: Tensor | None,
-        marks: Tensor | None,
+        to: Target,
         work: Callable[..., None],
     ) -> list[Weights]:
         """For each batch, run the MLP in parallel over ranges of points, then the table in parallel over levels.
@@ -522,7 +517,7 @@ class NumbaField:
         batch = min(len(xyz), _BATCH)
         ranges = _ranges(batch)
         sums = [Weights(*map(np.zeros_like, network.weights)) for _ in ranges]
-        levels = np.empty((self.layout.levels, batch if parameters else 0, FEATURES), np.float32)
+        levels = np.empty((self.layout.levels, batch if to.parameters else 0, FEATURES), np.float32)
         slopes = np.empty((self.layout.levels, 0 if direction is None else batch, FEATURES), np.float32)
         v = xyz if direction is None else direction
         on = [level for level in reversed(range(self.layout.levels)) if grid.weights[level]]
@@ -533,10 +528,10 @@ class NumbaField:
                 for (start, stop), part in zip(ranges, sums, strict=True)
             ]
             parallel(of_ranges)
-            if table_gradient is None:
+            if to.table is None:
                 continue
-            gradient = table_gradient.numpy().reshape(-1)
-            touched = np.empty(self.layout.rows, np.uint8) if marks is None else marks.numpy()
+            gradient = to.table.numpy().reshape(-1)
+            touched = np.empty(self.layout.rows, np.uint8) if to.marks is None else to.marks.numpy()
             arrays = (xyz, first, count, levels, gradient, touched, v, slopes, direction is not None)
             parallel([partial(scatter_level, grid, level, *arrays) for level in on])
         return sums

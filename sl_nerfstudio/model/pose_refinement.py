@@ -115,11 +115,11 @@ def adjust_scan(
     """Adjust all poses together, fix the gauge, and keep the result only if held-out pixels agree better with it."""
     start = scene_rig(scan, S_scene_world)
     maps, held_out = maps_and_held_out(scan, samples)
-    stated = pose_prior(scan, S_scene_world, prior)
-    found = adjusted(scan, S_scene_world, start, maps, refine, stated, settings)
+    found = adjusted(scan, S_scene_world, maps, refine, prior, settings)
     decision = cross_validate(start, found.rig, held_out, maps, found.noise_px)
     if decision.better:
         return replace(found, cross_validation=decision)
+    stated = pose_prior(scan, S_scene_world, prior)
     nothing_learnt = decision.worse or refine == "off"
     sigma, factor = (stated.sigma, joint_of_prior(stated, start)) if nothing_learnt else _known_by_both(start, found)
     return replace(found, rig=start, sigma=sigma, factor=factor, cross_validation=decision, modes=())
@@ -140,13 +140,13 @@ def _known_by_both(start: Rig, found: ScanAdjustment) -> tuple[Float[Tensor, "fr
 def adjusted(
     scan: Scan,
     S_scene_world: Similarity,
-    start: Rig,
     maps: CoordinateMaps,
     refine: RefinePoses,
-    prior: PosePrior,
+    config: PriorConfig,
     settings: AdjustmentSettings,
 ) -> ScanAdjustment:
-    """Adjust the scan's poses from `start`, and restore the scan's lengths; not cross-validated."""
+    """Adjust the scan's poses, and restore the scan's lengths; not cross-validated."""
+    start, prior = scene_rig(scan, S_scene_world), pose_prior(scan, S_scene_world, config)
     begin = constrained(refine, start)
     found: Adjustment = adjust(begin, maps, prior, refine, settings)
     # a frame whose starting pose proved to be wrong must not turn or stretch the scene

@@ -59,8 +59,8 @@ class Preview:
         """Serve the page at the first free port; `shared`: to the whole network. Raises UserError if there is none."""
         port = _free_port()
         with redirect_stdout(io.StringIO()):  # viser prints its address, in a frame
-            self._server = viser.ViserServer(EVERYWHERE if shared else HOST, port, verbose=False)
-        found = self._server.get_port()
+            self.server = viser.ViserServer(EVERYWHERE if shared else HOST, port, verbose=False)
+        found = self.server.get_port()
         address = (
             f"{_own_address() if shared else HOST}:{found} (open it in a browser; the page ends with this command)"
         )
@@ -70,28 +70,23 @@ class Preview:
         self._drawn: dict[str, viser.SceneNodeHandle] = {}
         self._training = False
         self._due = -math.inf
-        gui = self._server.gui
+        gui = self.server.gui
         self._title = title
         self._said = gui.add_markdown("")
         self._shown = {name: gui.add_checkbox(name, True) for name in ("points", "cameras", "projectors", "surface")}
         self._groups: dict[str, viser.SceneNodeHandle] = {
-            name: self._server.scene.add_frame(f"/{name}", show_axes=False) for name in self._shown if name != "surface"
+            name: self.server.scene.add_frame(f"/{name}", show_axes=False) for name in self._shown if name != "surface"
         }
         for name, box in self._shown.items():
             box.on_update(lambda _, name=name: self._show(name))
-        self._server.on_client_connect(self._look)
-
-    @property
-    def server(self) -> viser.ViserServer:
-        """What serves the page, for those who show more on it."""
-        return self._server
+        self.server.on_client_connect(self._look)
 
     def __enter__(self) -> "Preview":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._server.stop()
-        loop = self._server._websock_server._broadcast_buffer.event_loop
+        self.server.stop()
+        loop = self.server._websock_server._broadcast_buffer.event_loop
         with suppress(RuntimeError):
             loop.call_soon_threadsafe(lambda: None)  # wake it, or it closes the port with the next message only
 
@@ -114,7 +109,7 @@ class Preview:
     def trained(self, model: "TrainedModel") -> None:
         """Draw the surface after a step of the training, if a browser is connected and enough time has passed."""
         begun = time.monotonic()
-        if begun < self._due or not self._server.get_clients():
+        if begun < self._due or not self.server.get_clients():
             return
         if not self._training:  # there is no surface yet, but a sphere
             self._training = True
@@ -142,7 +137,7 @@ class Preview:
         `frames` are names, cameras and projectors. Without `S_scene_world`, the scene is like that of the training:
         upright, about the points.
         """
-        scene, first = self._server.scene, self._devices is None
+        scene, first = self.server.scene, self._devices is None
         most = min(_MOST_OF_A_FRAME, MOST_POINTS // max(len(poses), 1))
         seen = zip(frames, coords, poses.T_world_camera, poses.T_world_projector, strict=True)
         points = [
@@ -155,7 +150,7 @@ class Preview:
         placed = poses.mapped(S_scene_world)
         self._devices, size = placed.stacked(), pyramid_size(placed.T_world_camera)
         before, self._drawn = self._drawn, {}
-        with self._server.atomic():
+        with self.server.atomic():
             colours = _colours(len(frames))
             rows = zip(frames, placed.T_world_camera, placed.T_world_projector, points, colours, strict=True)
             for (name, camera, projector), T_camera, T_projector, p, colour in rows:
@@ -170,7 +165,7 @@ class Preview:
             for name in before.keys() - self._drawn.keys():
                 before[name].remove()
         if first or self._training:
-            for client in self._server.get_clients().values():
+            for client in self.server.get_clients().values():
                 self._look(client)
 
     def _draw_surface(self, model: "TrainedModel") -> None:
@@ -181,7 +176,7 @@ class Preview:
         except UserError as error:
             return self.say(f"training, step {model.step}: {first_line(error)}")
         first, self._surface = self._surface is None, mesh.vertices
-        self._groups["surface"] = self._server.scene.add_mesh_simple(
+        self._groups["surface"] = self.server.scene.add_mesh_simple(
             "/surface", SCENE_SCALE * mesh.vertices, mesh.faces, color=CLAY, visible=self._shown["surface"].value
         )
         if first:

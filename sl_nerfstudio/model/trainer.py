@@ -1,5 +1,6 @@
 """What `ns-train` is asked for, and what is checked before it starts: faults are found before anything is written."""
 
+import os
 import shlex
 import sys
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,6 @@ from sl_nerfstudio.model.run_files import (
     CONFIG,
     INTERRUPTION,
     Checkpoint,
-    RunFolder,
     checkpoints_in,
     find_checkpoint,
     go_on_command,
@@ -35,13 +35,14 @@ from sl_nerfstudio.model.run_files import (
     read_checkpoint,
     require_unused,
     settings_fingerprint,
+    take_folder,
 )
 from sl_nerfstudio.parallel import gpu_fault, gpu_found
 from sl_nerfstudio.scan import require_valid
 from sl_nerfstudio.storage import write_atomic
 
-_TAKEN: dict[Path, RunFolder] = {}
-"""The folders that this process writes to: not part of a configuration, which is written to config.yml."""
+_TAKEN: dict[Path, int] = {}
+"""The folders that this process writes to, with their locks: not part of a configuration, which is a file there."""
 
 
 @dataclass
@@ -159,9 +160,9 @@ class SLTrainerConfig(TrainerConfig):
 
     def leave_folder(self) -> None:
         """Let other processes have the run's folder."""
-        folder = _TAKEN.pop(self.get_base_dir(), None)
-        if folder is not None:
-            folder.leave()
+        lock = _TAKEN.pop(self.get_base_dir(), None)
+        if lock is not None:
+            os.close(lock)
 
     def _continue(self) -> Checkpoint | None:
         """For the config.yml of an earlier run: go on where its last checkpoint is, up to the run's last step."""
@@ -210,13 +211,13 @@ class SLTrainerConfig(TrainerConfig):
                 require_unused(folder, models, method)
 
         require()
-        taken = RunFolder(folder)
+        lock = take_folder(folder)
         try:
             require()  # again: another process may have written meanwhile
         except UserError:
-            taken.leave()
+            os.close(lock)
             raise
-        _TAKEN[folder] = taken
+        _TAKEN[folder] = lock
         self.last_step = self.max_num_iterations + (-1 if begun is None else begun.step)
 
     def _scan_root(self) -> Path:

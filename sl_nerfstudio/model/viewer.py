@@ -39,7 +39,6 @@ from sl_nerfstudio.model.scene_nodes import (
     look_at_object,
     place,
     pyramid_size,
-    rods,
 )
 from sl_nerfstudio.scan import Scan
 
@@ -314,9 +313,8 @@ class SceneView(ViewerControl):
         frame, (camera, projector) = self.panel.chosen_frame, self._model.poses_scene()
         segments = pattern_rays(self._model.scan, frame, camera[frame], projector[frame])
         for kind, ends in zip(COLOURS, segments, strict=True):
-            drawn = rods(ends * SCENE_SCALE, _RAY * self._scale)
-            name = f"/rays/{kind}"
-            self._nodes[name] = add_rods(self.viser_server.scene, name, *drawn, COLOURS[kind])
+            name, scene = f"/rays/{kind}", self.viser_server.scene
+            self._nodes[name] = add_rods(scene, name, ends * SCENE_SCALE, _RAY * self._scale, COLOURS[kind])
 
     def show_surface(self) -> None:
         """Draw the surface as a mesh in the chosen colours, or leave it to the rendered picture."""

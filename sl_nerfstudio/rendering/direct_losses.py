@@ -125,9 +125,7 @@ class MeasuredRays:
 
     def chosen(self, index: Bool[Tensor, "n"]) -> "MeasuredRays":
         """Some of the rays."""
-        return MeasuredRays(
-            self.origins[index], self.directions[index], self.T_scene_projector[index], self.uv_projector[index]
-        )
+        return MeasuredRays(*(values[index] for values in vars(self).values()))
 
 
 def random_points(count: int, device: torch.device) -> Float[Tensor, "n 3"]:

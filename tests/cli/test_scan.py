@@ -178,9 +178,9 @@ class Browser(threading.Thread):
 
     def __init__(self, preview: Preview) -> None:
         super().__init__(daemon=True)
-        self.port, self.got = preview._server.get_port(), []
+        self.port, self.got = preview.server.get_port(), []
         self.start()
-        while not preview._server.get_clients():
+        while not preview.server.get_clients():
             time.sleep(0.01)
 
     def run(self) -> None:

@@ -99,8 +99,7 @@ def test_disturbed_poses_are_refined_and_the_known_baseline_is_kept(scan, true):
 def adjusted_poses(scan: Scan, samples: PixelSamples) -> ScanAdjustment:
     """The result of the adjustment without cross-validation."""
     maps, _ = maps_and_held_out(scan, samples)
-    prior = pose_prior(scan, S_SCENE_WORLD, PriorConfig())
-    return adjusted(scan, S_SCENE_WORLD, scene_rig(scan, S_SCENE_WORLD), maps, "free", prior, QUICK)
+    return adjusted(scan, S_SCENE_WORLD, maps, "free", PriorConfig(), QUICK)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.methods import sl_neus_paper
-from sl_nerfstudio.model.run_files import LOCK, RunFolder
+from sl_nerfstudio.model.run_files import LOCK, take_folder
 from tests.model.training.small_runs import (
     child,
     content,
@@ -137,22 +137,22 @@ def test_two_processes_do_not_write_to_one_folder(tmp_path):
     folder = tmp_path / "run"
 
     def hold() -> None:
-        taken = RunFolder(folder)
-        (taken.path / "ready").touch()
+        take_folder(folder)
+        (folder / "ready").touch()
         time.sleep(60)
 
     other = child(hold)
     while not (folder / "ready").exists():
         time.sleep(0.01)
     with pytest.raises(UserError, match=rf"another ns-train is writing there \(process {other}\)"):
-        RunFolder(folder)
+        take_folder(folder)
     os.kill(other, signal.SIGKILL)
     os.waitpid(other, 0)
-    RunFolder(folder).leave()
-    RunFolder(folder).leave()
+    for _ in range(2):
+        os.close(take_folder(folder))
 
 
 @pytest.mark.parametrize("place", ["/proc/run", "/dev/null/run"])
 def test_a_place_that_cannot_be_written(place):
     with pytest.raises(UserError, match=r"cannot be written \((.|\n)*--output-dir"):
-        RunFolder(Path(place))
+        take_folder(Path(place))
