@@ -108,9 +108,7 @@ def distance_to_sphere_mm(vertices: np.ndarray) -> np.ndarray:
 # ---- training
 
 
-def test_training_saves_and_prints_the_next_commands(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_training_saves_and_prints_the_next_commands(root, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     config = train(monkeypatch, root, tmp_path / "a folder", 3)
     assert [p.name for p in (config.parent / "nerfstudio_models").iterdir()] == ["step-000000002.ckpt"]

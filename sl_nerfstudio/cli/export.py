@@ -238,6 +238,8 @@ def _place(path: Path, overwrite: bool) -> Iterator[str]:
 _SUSPICIOUS_PX = 3.0
 _LONG_SECONDS = 15.0
 _SAME_EXPOSURE = 1.02
+_TURNED = {"z-up": "up for the cameras is +z", "plane": "it stands on z = 0, about the origin"}
+_SOLID = "  a closed solid; what nobody saw ends flat at the convex hull of what was seen"
 
 
 def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
@@ -253,11 +255,11 @@ def description(config: ExportConfig, scan: "Scan", exported: "Exported") -> str
     lines = [
         f"{config.output}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {extent} {unit}",
         *_file_unit(config.output, scan.units),
-        *_axes(config),
-        *(_solid(exported) if config.watertight else _removed(surface)),
+        *([] if config.align is None else [f"  turned: {_TURNED[config.align]}"]),
+        *([_SOLID, *_agreement(surface)] if config.watertight else _removed(surface)),
         *_filled(config, surface, unit),
         *_cut(config, surface, unit),
-        *_pieces(config, surface),
+        *([f"  --largest-component removed {surface.other_pieces:,} other pieces"] if config.largest_component else []),
         *_invented(config, exported),
         *_decimated(exported, unit),
         *(_colours(exported) if exported.textured is None else _texture_words(exported, exported.textured, unit)),
@@ -301,18 +303,6 @@ def _file_unit(path: Path, units: str) -> list[str]:
         return [f"  {text}{f' ({note})' if note else ''}"]
     scaled = "" if units == short else f"; scaled from {units}"
     return [f"  written in {word}s{scaled}{f' ({note})' if note else ' (STL states no unit itself)'}"]
-
-
-def _axes(config: ExportConfig) -> list[str]:
-    turned = {"z-up": "up for the cameras is +z", "plane": "it stands on z = 0, about the origin"}
-    return [] if config.align is None else [f"  turned: {turned[config.align]}"]
-
-
-def _solid(exported: "Exported") -> list[str]:
-    return [
-        "  a closed solid; what nobody saw ends flat at the convex hull of what was seen",
-        *_agreement(exported.surface),
-    ]
 
 
 def _removed(surface: "ExtractedSurface") -> list[str]:
@@ -373,12 +363,6 @@ def _cut(config: ExportConfig, surface: "ExtractedSurface", unit: str) -> list[s
     if config.watertight and cut.removed:
         lines = [f"  --object-only cut the solid off flat at {len(cut.removed)} planes around the object"]
     return lines + [f"    {plane_sentence(plane, plane in cut.removed)}" for plane in cut.planes]
-
-
-def _pieces(config: ExportConfig, surface: "ExtractedSurface") -> list[str]:
-    if not config.largest_component:
-        return []
-    return [f"  --largest-component removed {surface.other_pieces:,} other pieces"]
 
 
 def _invented(config: ExportConfig, exported: "Exported") -> list[str]:

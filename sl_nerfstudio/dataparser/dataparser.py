@@ -112,17 +112,8 @@ def require_same_scan(root: Path, actual: str, stated: str | None, of_what: str)
 
 # Every masked pixel of a scan in one compact table, and random draws from it.
 
-_RECORD = np.dtype(
-    [
-        ("frame", "i4"),
-        ("coords", "f4", 2),
-        ("row", "i2"),
-        ("column", "i2"),
-        ("pattern", "f2"),
-        ("held_out", "?"),
-        ("", "V1"),
-    ]
-)  # what is known of a pixel lies together: a table that is in a file is read once for it
+_FIELDS = [("frame", "i4"), ("coords", "f4", 2), ("row", "i2"), ("column", "i2"), ("pattern", "f2"), ("held_out", "?")]
+_RECORD = np.dtype([*_FIELDS, ("", "V1")])  # a pixel's fields lie together: a table in a file is read once for them
 _AT_ONCE = 2**24  # pixels: bounds memory
 
 

@@ -231,13 +231,11 @@ def ray_outputs(
         return _rendered(renderer, origins, directions, T_scene_projector, view, ends)
     some_ends = None if ends is None else (ends[0][near], ends[1][near])
     some = _rendered(renderer, origins[near], directions[near], T_scene_projector, view[near], some_ends)
-    return {name: _spread(values, near, _NOTHING.get(name, 0.0)) for name, values in some.items()}
-
-
-def _spread(values: Float[Tensor, "some c"], where: Bool[Tensor, "rays"], elsewhere: float) -> Float[Tensor, "rays c"]:
-    result = values.new_full((len(where), values.shape[1]), elsewhere)
-    result[where] = values
-    return result
+    outputs = {}
+    for name, values in some.items():
+        outputs[name] = values.new_full((len(near), values.shape[1]), _NOTHING.get(name, 0.0))
+        outputs[name][near] = values
+    return outputs
 
 
 def _rendered(

@@ -161,16 +161,13 @@ class SLPipeline(VanillaPipeline):
     ) -> list[TrainingCallback]:
         """The model's callbacks, with those of this pipeline before and after them."""
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+        trainer = cast(SLTrainer, training_callback_attributes.trainer)
         return [
-            TrainingCallback([before], cast(SLTrainer, training_callback_attributes.trainer).begin_step),
+            TrainingCallback([before], trainer.begin_step),
             TrainingCallback([before], self._seed_step),
             *super().get_training_callbacks(training_callback_attributes),
             TrainingCallback([after], self._update_viewer),
-            TrainingCallback(
-                [TrainingCallbackLocation.AFTER_TRAIN],
-                self._say_what_next,
-                kwargs={"trainer": training_callback_attributes.trainer},
-            ),
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._say_what_next, kwargs={"trainer": trainer}),
         ]
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:

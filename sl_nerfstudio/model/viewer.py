@@ -348,8 +348,9 @@ class SceneView(ViewerControl):
         self._nodes["/surface"] = self.viser_server.scene.add_mesh_trimesh("/surface", mesh)
 
     def _remove(self, name: str) -> None:
-        if name in self._nodes:
-            self._nodes.pop(name).remove()
+        node = self._nodes.pop(name, None)
+        if node is not None:
+            node.remove()
 
     # ---- poses
 

@@ -123,9 +123,7 @@ def test_refined_poses_are_compared_with_the_initial_ones(scan: Path, tmp_path: 
 
 
 @pytest.mark.slow
-def test_what_is_not_printed_is_in_the_report_that_was_written_or_could_be(
-    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_what_is_not_printed_is_in_the_report_that_was_written_or_could_be(scan, tmp_path, capsys):
     known = read_scan(scan)
     wrong = DevicePoses(known.poses.T_world_camera.copy(), known.poses.T_world_projector)
     wrong.T_world_camera[:, :3, 3] += [6.0, 0.0, 0.0]
@@ -188,9 +186,7 @@ def test_a_part_in_other_axes_is_inspected(tmp_path: Path, capsys: pytest.Captur
     assert "there is no nominal surface" in failure(*given[:4], "--tolerance", "0.1 mm")
 
 
-def test_what_cannot_be_evaluated_is_named_and_nothing_is_written(
-    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_evaluated_is_named_and_nothing_is_written(scan, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(scan, "scan")
     truth, stated = read_mesh(mesh_of(scan)), scan / "transforms.json"

@@ -34,14 +34,8 @@ def test_batch_matches_its_rays(datamanager: SLDataManager) -> None:
     """Independent of the table of pixels: rays hit the sphere where the coordinates in the files say."""
     rays, batch = datamanager.next_train(0)
     loaded = datamanager.dataparser.loaded
-    assert {k: tuple(v.shape) for k, v in batch.items()} == {
-        "indices": (200, 3),
-        "coords": (200, 2),
-        "decoded": (200, 1),
-        "pattern": (200, 1),
-        "image": (200, 3),
-        "mask": (200, 1),
-    }
+    columns = {"indices": 3, "coords": 2, "decoded": 1, "pattern": 1, "image": 3, "mask": 1}
+    assert {name: tuple(values.shape) for name, values in batch.items()} == {k: (200, c) for k, c in columns.items()}
     for i in range(0, 200, 7):
         number, row, column = batch["indices"][i].tolist()
         frame = loaded.scan.frames[number]
@@ -147,15 +141,8 @@ def test_all_cameras_are_at_refined_poses(tiny_root: Path) -> None:
     frame = batch["indices"][:, 0]
     assert rays.metadata["sl_refined"].all()
     torch.testing.assert_close(rays.origins, T[frame, :3, 3])
-    holders = (
-        m.train_dataset,
-        m.eval_dataset,
-        m.train_dataparser_outputs,
-        m.eval_dataset._dataparser_outputs,
-        m.fixed_indices_eval_dataloader,
-        m.eval_dataloader,
-    )
-    for holder in holders:
+    outputs, loaders = m.train_dataparser_outputs, (m.fixed_indices_eval_dataloader, m.eval_dataloader)
+    for holder in (m.train_dataset, m.eval_dataset, outputs, m.eval_dataset._dataparser_outputs, *loaders):
         torch.testing.assert_close(holder.cameras.camera_to_worlds, T[:, :3])
         assert not holder.cameras.camera_to_worlds.requires_grad  # exporters call .numpy()
         assert holder.cameras.generate_rays(0).metadata["sl_refined"].all()

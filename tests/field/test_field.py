@@ -35,9 +35,7 @@ def reference(p: Tensor, g: Tensor, v: Tensor | None, hidden: int) -> tuple[list
 @pytest.mark.parametrize(("backend", "dtype", "tolerance"), CASES)
 @pytest.mark.parametrize("hidden", [24, 40])
 @pytest.mark.parametrize("of_gradients", [False, True])
-def test_values_and_derivatives_are_those_of_double_backward(
-    backend: str, dtype: torch.dtype, tolerance: float, hidden: int, of_gradients: bool
-) -> None:
+def test_values_and_derivatives_are_those_of_double_backward(backend, dtype, tolerance, hidden, of_gradients):
     """Of values by points and parameters, and of values and gradients by the parameters."""
     p, g = points_around(300), torch.randn(300).double()
     v = torch.randn(300, 3).double() if of_gradients else None

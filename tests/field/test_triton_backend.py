@@ -118,9 +118,7 @@ def test_what_the_backend_cannot_do_is_said_when_it_is_chosen_by_hand(monkeypatc
         (ImportError("libtriton.so: broken"), r"ImportError: libtriton\.so: broken"),
     ],
 )
-def test_a_triton_that_does_not_work_is_said_with_its_cause(
-    error: Exception, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_triton_that_does_not_work_is_said_with_its_cause(error, said, monkeypatch):
     def fails(*_: Any) -> None:
         raise error
 
