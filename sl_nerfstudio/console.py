@@ -19,29 +19,22 @@ _NAME = 12  # columns of the name before a text
 
 def paragraph(name: str, text: str) -> str:
     """`text` beside `name`, in lines of at most 80 columns; the lines of `text` stay lines of their own."""
-    lines = [part for line in text.splitlines() for part in _wrapped(line)]
+    lines = [part for line in text.splitlines() for part in _wrapped(line, WIDTH - _NAME)]
     return "\n".join(f"{name if k == 0 else '':<{_NAME}}{line}" for k, line in enumerate(lines))
 
 
-def _wrapped(line: str) -> list[str]:
-    inset = len(line) - len(line.lstrip())
+def _wrapped(line: str, width: int, hanging: str = "") -> list[str]:
+    inset = " " * (len(line) - len(line.lstrip()))
     return textwrap.wrap(
-        line.strip(), WIDTH - _NAME, initial_indent=" " * inset, subsequent_indent=" " * inset,
+        line.strip(), width, initial_indent=inset, subsequent_indent=inset + hanging,
         break_long_words=False, break_on_hyphens=False,
     )  # fmt: skip
 
 
 def fitted(text: str) -> str:
     """`text` in lines of at most 80 columns; what does not fit continues four columns further to the right."""
-    return "\n".join(line if len(line) <= WIDTH else _continued(line) for line in text.splitlines())
-
-
-def _continued(line: str) -> str:
-    inset = " " * (len(line) - len(line.lstrip()))
-    return textwrap.fill(
-        line.strip(), WIDTH, initial_indent=inset, subsequent_indent=f"{inset}    ",
-        break_long_words=False, break_on_hyphens=False,
-    )  # fmt: skip
+    lines = ([line] if len(line) <= WIDTH else _wrapped(line, WIDTH, "    ") for line in text.splitlines())
+    return "\n".join(part for parts in lines for part in parts)
 
 
 def duration(seconds: float) -> str:

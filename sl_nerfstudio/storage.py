@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from io import BytesIO
 from pathlib import Path, PurePosixPath
-from types import TracebackType
 from typing import IO
 
 import numpy as np
@@ -51,6 +50,11 @@ def cannot_write(path: Path, error: OSError) -> UserError:
         "    cause:  the disk is full, the folder is read-only, or there is a file where a folder is needed\n"
         "    remedy: free some space, or choose another output"
     )
+
+
+def _already_there(path: Path, problem: str, cause: str) -> UserError:
+    """The error for an output that cannot be written because of what is there."""
+    return UserError(f"{path}: {problem}\n    cause:  {cause}\n    remedy: choose another output, or remove it first")
 
 
 @contextmanager
@@ -372,7 +376,7 @@ def require_empty(root: Path) -> None:
             return
     except OSError as error:
         problem, cause = f"cannot be read ({error.strerror})", "missing permissions"
-    raise UserError(f"{root}: {problem}\n    cause:  {cause}\n    remedy: choose another output, or remove it first")
+    raise _already_there(root, problem, cause)
 
 
 # Files that are used only if they are whole: a digest of the content follows it.
@@ -444,7 +448,11 @@ class NewFolder:
             left = _listed(self._lock.lines)
             foreign = _foreign(self.root, [*left, *self._earlier])
             if foreign is not None:
-                raise _not_empty(self.root, foreign, self._lock)
+                killed, cause = self._lock.left_by, "it holds an earlier result"
+                if killed is not None:
+                    mine = foreign.relative_to(self.root)
+                    cause = f"{killed} was killed before it had finished, and {mine} was not listed by it"
+                raise _already_there(self.root, "is not empty", cause)
             left = [path for path in left if path not in self._earlier]  # of which nothing is gone yet
             _remove(self.root, left)
             if left:
@@ -475,9 +483,7 @@ class NewFolder:
         """The folder itself."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Let go of the folder; after an exception without what was written."""
         self.close(complete=kind is None)
 
@@ -532,18 +538,6 @@ def _remove(root: Path, paths: Iterable[str]) -> None:
     remove_empty(sorted(folders, key=lambda folder: -len(folder.parts)))
 
 
-def _not_empty(root: Path, foreign: Path, lock: LockFile) -> UserError:
-    if lock.left_by is None:
-        cause = "it holds an earlier result"
-    else:
-        cause = (
-            f"{lock.left_by} was killed before it had finished, and {foreign.relative_to(root)} was not listed by it"
-        )
-    return UserError(
-        f"{root}: is not empty\n    cause:  {cause}\n    remedy: choose another output, or remove it first"
-    )
-
-
 # Files that a command writes again and again, such as a report: only its own earlier ones are replaced.
 
 _LOOKED_AT = 4096  # bytes at the beginning of a file
@@ -578,7 +572,7 @@ def _require_earlier_result(path: Path, mark: bytes) -> None:
             problem, cause = "would be overwritten, and is no earlier result of this command", "a typing error"
     except OSError as error:
         problem, cause = f"cannot be read ({error.strerror})", "a name that is too long, or missing permissions"
-    raise UserError(f"{path}: {problem}\n    cause:  {cause}\n    remedy: choose another output, or remove it first")
+    raise _already_there(path, problem, cause)
 
 
 # Arrays that grow piece by piece, or are many: in memory, or in a temporary file once they are large.

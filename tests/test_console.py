@@ -138,9 +138,7 @@ def wait_for(said: str, stream: Terminal) -> None:
         time.sleep(0.01)
 
 
-def test_a_phase_prints_lines_where_there_is_no_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_phase_prints_lines_where_there_is_no_terminal(monkeypatch, capsys):
     log = io.StringIO()
     monkeypatch.setattr(sys, "stderr", log)
     monkeypatch.setattr(console, "PLAIN_SECONDS", 0.01)
@@ -156,9 +154,7 @@ def test_a_phase_prints_lines_where_there_is_no_terminal(
     assert capsys.readouterr().out == "train       100 steps\n"
 
 
-def test_loops_and_phases_in_a_phase_are_its_progress_and_leave_it_as_it_was(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_loops_and_phases_in_a_phase_are_its_progress_and_leave_it_as_it_was(monkeypatch, capsys):
     monkeypatch.setattr(console, "PLAIN_SECONDS", 1e9)
     with phase("register") as shown:
         for _ in track(range(3), "rounds"):

@@ -15,17 +15,12 @@ from pathlib import Path
 import pytest
 
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from tests.test_package import SCRIPTS
 
 ROOT = Path(__file__).parents[1]
 LOG = ROOT / "benchmarks" / "log.md"  # a record of experiments: it uses the names of its time
 PAGES = sorted(path for folder in (".", "docs", "benchmarks", "training") for path in (ROOT / folder).glob("*.md"))
 CURRENT = [page for page in PAGES if page != LOG]
-SCRIPTS: dict[str, str] = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 SETTING = re.compile(r"--(?:pipeline|machine|viewer)\.[a-z.-]*[a-z]")
 CODE_FILE = re.compile(r"`([a-z_/]+\.py)`")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")

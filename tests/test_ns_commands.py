@@ -6,7 +6,6 @@ import os
 import re
 import sys
 import urllib.request
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,25 +15,20 @@ import pytest
 import torch
 import trimesh
 import yaml
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.scripts import eval as ns_eval
+from nerfstudio.scripts import exporter as ns_export
+from nerfstudio.scripts import render as ns_render
+from nerfstudio.scripts import train as ns_train
+from nerfstudio.utils import writer
+from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
 from PIL import Image
 
-from tests.dataparser.tiny_scan import RADIUS, TinyScan
-
-with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
-    warnings.simplefilter("ignore")
-    from nerfstudio.configs.base_config import ViewerConfig
-    from nerfstudio.scripts import eval as ns_eval
-    from nerfstudio.scripts import exporter as ns_export
-    from nerfstudio.scripts import render as ns_render
-    from nerfstudio.scripts import train as ns_train
-    from nerfstudio.utils import writer
-    from nerfstudio.utils.eval_utils import eval_setup
-    from nerfstudio.viewer.viewer import VISER_NERFSTUDIO_SCALE_RATIO, Viewer
-
-import sl_nerfstudio.parallel as sl_threads
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.pipeline import SLPipeline
+from tests.dataparser.tiny_scan import RADIUS, TinyScan
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # nerfstudio emits many warnings
 
@@ -47,10 +41,9 @@ STEPS = 40
 
 
 @pytest.fixture(autouse=True)
-def _same_threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _same_threads() -> Iterator[None]:
     """Opening a run in ns-export sets them for the rest of the process, here of the tests."""
     count = torch.get_num_threads()
-    monkeypatch.setattr(sl_threads, "_ours", None)
     yield
     torch.set_num_threads(count)
 
@@ -74,11 +67,8 @@ def call(entry: Callable[[], Any], monkeypatch: pytest.MonkeyPatch, *arguments: 
 
 def train(monkeypatch: pytest.MonkeyPatch, root: Path, output: Path, steps: int, *more: object) -> Path:
     """Train and return the run's config.yml."""
-    call(
-        ns_train.entrypoint,
-        monkeypatch,
-        *("sl-neus", "--data", root, "--output-dir", output, "--max-num-iterations", steps, *SMALL, *more),
-    )
+    places = ("--data", root, "--output-dir", output)
+    call(ns_train.entrypoint, monkeypatch, "sl-neus", *places, "--max-num-iterations", steps, *SMALL, *more)
     (config,) = output.glob("*/sl-neus/*/config.yml")
     return config
 
@@ -118,9 +108,7 @@ def distance_to_sphere_mm(vertices: np.ndarray) -> np.ndarray:
 # ---- training
 
 
-def test_training_saves_and_prints_the_next_commands(
-    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_training_saves_and_prints_the_next_commands(root, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     config = train(monkeypatch, root, tmp_path / "a folder", 3)
     assert [p.name for p in (config.parent / "nerfstudio_models").iterdir()] == ["step-000000002.ckpt"]
@@ -144,11 +132,8 @@ def test_training_saves_and_prints_the_next_commands(
 
 
 def test_the_papers_method_trains(root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    call(
-        ns_train.entrypoint,
-        monkeypatch,
-        *("sl-neus-paper", "--data", root, "--output-dir", tmp_path, "--max-num-iterations", 3, *SMALL),
-    )
+    places = ("--data", root, "--output-dir", tmp_path)
+    call(ns_train.entrypoint, monkeypatch, "sl-neus-paper", *places, "--max-num-iterations", 3, *SMALL)
     assert list(tmp_path.glob("*/sl-neus-paper/*/nerfstudio_models/step-000000002.ckpt"))
     (config,) = tmp_path.glob("*/sl-neus-paper/*/config.yml")
     model = eval_setup(config)[1].model
@@ -163,50 +148,44 @@ def test_the_papers_method_trains(root: Path, tmp_path: Path, monkeypatch: pytes
 # ---- commands that use a result
 
 
-def test_eval_writes_finite_json_about_held_out_pixels(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def export(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Calls `ns-export` for one kind of file."""
+
+    def run(kind: str, *flags: object) -> None:
+        places = ("--load-config", config, "--output-dir", tmp_path)
+        call(ns_export.entrypoint, monkeypatch, kind, *places, *flags)
+
+    return run
+
+
+def test_eval_writes_finite_json_about_held_out_pixels(config, tmp_path, monkeypatch) -> None:
     def no_constants(name: str) -> None:
         raise AssertionError(f"{name} is not JSON")
 
-    call(
-        ns_eval.entrypoint,
-        monkeypatch,
-        *("--load-config", config, "--output-path", tmp_path / "out.json", "--render-output-path", tmp_path / "images"),
-    )
+    outputs = ("--output-path", tmp_path / "out.json", "--render-output-path", tmp_path / "images")
+    call(ns_eval.entrypoint, monkeypatch, "--load-config", config, *outputs)
     results = json.loads((tmp_path / "out.json").read_text(), parse_constant=no_constants)["results"]
     assert results["coordinate_px"] < 3 and results["coordinate_px_std"] >= 0
     assert {p.name.split("_")[1] for p in (tmp_path / "images").iterdir()} == {"00000", "00001", "00002"}
 
 
-def test_export_pointcloud_in_the_scans_units(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    call(
-        ns_export.entrypoint,
-        monkeypatch,
-        *("pointcloud", "--load-config", config, "--output-dir", tmp_path, "--num-points", 1000),
-        *("--num-rays-per-batch", 2000, "--save-world-frame", True),
-    )
+def test_export_pointcloud_in_the_scans_units(export, tmp_path) -> None:
+    export("pointcloud", "--num-points", 1000, "--num-rays-per-batch", 2000, "--save-world-frame", True)
     cloud = trimesh.load(tmp_path / "point_cloud.ply")
     assert np.median(distance_to_sphere_mm(np.asarray(cloud.vertices))) < 2
 
 
-def test_export_tsdf(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pipeline: SLPipeline) -> None:
-    call(
-        ns_export.entrypoint,
-        monkeypatch,
-        *("tsdf", "--load-config", config, "--output-dir", tmp_path, "--resolution", 48, "--downscale-factor", 1),
-        *("--texture-method", "tsdf"),
-    )
+def test_export_tsdf(export, tmp_path, pipeline) -> None:
+    export("tsdf", "--resolution", 48, "--downscale-factor", 1, "--texture-method", "tsdf")
     mesh = trimesh.load(tmp_path / "tsdf_mesh.ply")
     S = pipeline.datamanager.dataparser.loaded.S_scene_world.inverse()
     # half of the mesh is the unobserved inside of nerfstudio's volume; the sphere must be in it
     assert (distance_to_sphere_mm(S.points(np.asarray(mesh.vertices))) < 3).mean() > 0.3
 
 
-def test_export_cameras_gives_the_refined_poses(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pipeline: SLPipeline
-) -> None:
-    call(ns_export.entrypoint, monkeypatch, "cameras", "--load-config", config, "--output-dir", tmp_path)
+def test_export_cameras_gives_the_refined_poses(export, tmp_path, pipeline) -> None:
+    export("cameras")
     refined = pipeline._sl_model.poses_scene()[0]
     for name in ("transforms_train.json", "transforms_eval.json"):
         frames = json.loads((tmp_path / name).read_text())
@@ -222,24 +201,18 @@ def test_export_marching_cubes_finds_what_it_needs(pipeline: SLPipeline, monkeyp
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="the refusal is for machines without a GPU")
-def test_export_marching_cubes_ends_in_a_sentence_without_a_gpu(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_export_marching_cubes_ends_in_a_sentence_without_a_gpu(export, capfd) -> None:
     with pytest.raises(SystemExit) as end:
-        call(ns_export.entrypoint, monkeypatch, *("marching-cubes", "--load-config", config, "--output-dir", tmp_path))
+        export("marching-cubes")
     err = capfd.readouterr().err
     assert end.value.code == 1 and len(err.splitlines()) == 1
     assert err.startswith("error: ns-export marching-cubes needs a GPU") and "sl-export --load-config" in err
 
 
-def test_export_poisson(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_export_poisson(export, tmp_path) -> None:
     """The default, `--texture-method nerf`: the whole texture is drawn, and its colours are those of the surface."""
-    call(
-        ns_export.entrypoint,
-        monkeypatch,
-        *("poisson", "--load-config", config, "--output-dir", tmp_path, "--num-points", 1000),
-        *("--num-rays-per-batch", 2000, "--target-num-faces", 500, "--num-pixels-per-side", 64),
-    )
+    sizes = ("--num-points", 1000, "--num-rays-per-batch", 2000, "--target-num-faces", 500, "--num-pixels-per-side", 64)
+    export("poisson", *sizes)
     assert len(trimesh.load(tmp_path / "poisson_mesh.ply").faces) > 500
     mesh = trimesh.load(tmp_path / "mesh.obj")
     assert 100 < len(mesh.faces) <= 500
@@ -250,9 +223,7 @@ def test_export_poisson(config: Path, tmp_path: Path, monkeypatch: pytest.Monkey
     assert (texture[row, column].max(-1) > 0).mean() > 0.8
 
 
-def test_trajectories_are_rendered_where_ffmpeg_is(
-    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pipeline: SLPipeline
-) -> None:
+def test_trajectories_are_rendered_where_ffmpeg_is(config, tmp_path, monkeypatch, pipeline) -> None:
     """With a stand-in for ffmpeg: images are written without it, but nerfstudio asks for it first."""
     (tmp_path / "ffmpeg").touch(mode=0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
@@ -262,13 +233,9 @@ def test_trajectories_are_rendered_where_ffmpeg_is(
         "camera_path": [{"camera_to_world": T.flatten().tolist(), "fov": 30, "aspect": 1.2}] * 2,
     }  # fmt: skip
     (tmp_path / "path.json").write_text(json.dumps(path))
-    call(
-        ns_render.entrypoint,
-        monkeypatch,
-        *("camera-path", "--load-config", config, "--output-path", tmp_path / "way", "--output-format", "images"),
-        *("--camera-path-filename", tmp_path / "path.json"),
-        *("--rendered-output-names", "coordinates", "pattern", "--image-format", "png"),
-    )
+    flags = ["--output-path", tmp_path / "way", "--camera-path-filename", tmp_path / "path.json"]
+    flags += ["--rendered-output-names", "coordinates", "pattern", "--output-format", "images", "--image-format", "png"]
+    call(ns_render.entrypoint, monkeypatch, "camera-path", "--load-config", config, *flags)
     image = np.asarray(Image.open(tmp_path / "way" / "00000.png")).astype(int)
     coordinates, pattern = np.split(image, 2, axis=1)
     seen = coordinates.any(-1)
@@ -278,12 +245,8 @@ def test_trajectories_are_rendered_where_ffmpeg_is(
 
 
 def test_render_dataset(config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    call(
-        ns_render.entrypoint,
-        monkeypatch,
-        *("dataset", "--load-config", config, "--output-path", tmp_path, "--split", "train+test"),
-        *("--downscale-factor", 2, "--image-format", "png"),
-    )
+    flags = ("--output-path", tmp_path, "--split", "train+test", "--downscale-factor", 2, "--image-format", "png")
+    call(ns_render.entrypoint, monkeypatch, "dataset", "--load-config", config, *flags)
     for split in ("train", "test"):
         for output in ("gt-rgb", "rgb", "depth", "normals", "accumulation", "coordinates", "pattern", "residual"):
             assert Image.open(tmp_path / split / output / "frame_00001.png").size == (24, 20)
@@ -319,18 +282,14 @@ def test_viewer_shows_cameras_and_projectors_before_and_after(viewer: Viewer, pi
     assert not viewer.control_panel.layer_depth
 
 
-def test_viewer_moves_the_captured_images_with_the_poses(
-    viewer: Viewer, pipeline: SLPipeline, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    camera, projector = pipeline._sl_model.poses_scene()
-    moved = camera.clone()
+def test_viewer_moves_the_captured_images_with_the_poses(viewer, pipeline, monkeypatch) -> None:
+    camera, projector = (T.double().numpy() for T in pipeline._sl_model.poses_scene())
+    moved = camera.copy()
     moved[:, 0, 3] += 1
-    monkeypatch.setattr(
-        pipeline.scene_view, "_numpy_poses", lambda: (moved.double().numpy(), projector.double().numpy())
-    )
+    monkeypatch.setattr(pipeline.scene_view, "_numpy_poses", lambda: (moved, projector))
     pipeline.scene_view.update(force=True)
     positions = [viewer.camera_handles[i].position for i in range(3)]
-    np.testing.assert_allclose(positions, moved[:, :3, 3].numpy() * 10, atol=1e-4)
+    np.testing.assert_allclose(positions, moved[:, :3, 3] * 10, atol=1e-4)
 
 
 def test_every_output_can_be_shown(pipeline: SLPipeline) -> None:

@@ -4,7 +4,6 @@ import copy
 import dataclasses
 import subprocess
 import sys
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,16 +12,12 @@ from typing import Any
 import pytest
 import torch
 import yaml
-
-from tests.dataparser.tiny_scan import TinyScan
-
-with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
-    warnings.simplefilter("ignore")
-    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-    from nerfstudio.scripts import train as ns_train
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.scripts import train as ns_train
 
 from sl_nerfstudio.methods import sl_neus
 from sl_nerfstudio.model.trainer import SLTrainerConfig
+from tests.dataparser.tiny_scan import TinyScan
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio emits many warnings
 
@@ -32,29 +27,24 @@ def scan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return TinyScan().write(tmp_path_factory.mktemp("scans") / "sphere")
 
 
-def start(root: Path | None, **settings: Any) -> None:
-    """What ns-train does with its parsed command line."""
-    config = copy.deepcopy(sl_neus.config)
-    config.data = root
-    for name, value in settings.items():
-        setattr(config, name, value)
-    ns_train.main(config)
+@pytest.fixture
+def refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What ns-train says of a scan, and of settings other than the usual; checks that nothing was written."""
 
+    def run(root: Path | None, **settings: Any) -> str:
+        empty = tmp_path / "here"
+        empty.mkdir()
+        monkeypatch.chdir(empty)
+        config = copy.deepcopy(sl_neus.config)
+        for name, value in {"data": root, **settings}.items():
+            setattr(config, name, value)
+        with pytest.raises(SystemExit) as exit_:
+            ns_train.main(config)
+        out, err = capfd.readouterr()
+        assert exit_.value.code == 1 and not list(empty.iterdir()) and "Traceback" not in out + err
+        return err
 
-def refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], *a: Any, **k: Any
-) -> str:
-    """The message; checks that nothing was written."""
-    empty = tmp_path / "here"
-    empty.mkdir()
-    monkeypatch.chdir(empty)
-    with pytest.raises(SystemExit) as exit_:
-        start(*a, **k)
-    assert exit_.value.code == 1
-    assert not list(empty.iterdir())
-    out, err = capfd.readouterr()
-    assert "Traceback" not in out + err
-    return err
+    return run
 
 
 def truncate(path: Path) -> None:
@@ -70,24 +60,29 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.mark.parametrize("damage, named", FAULTS.values(), ids=FAULTS.keys())
-def test_bad_scans_do_not_start(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-    damage: Callable[[Path], Any],
-    named: str,
-) -> None:
+def test_bad_scans_do_not_start(tmp_path, refused, damage, named) -> None:
     root = TinyScan().write(tmp_path / "scan")
     damage(root)
-    message = refused(tmp_path, monkeypatch, capfd, root)
+    message = refused(root)
     assert message.startswith("error: ") and str(root) in message
     assert named in message and "remedy: " in message
+
+
+def without_rays() -> Any:
+    pipeline = copy.deepcopy(sl_neus.config.pipeline)
+    pipeline.datamanager.train_num_rays_per_batch = 0
+    return pipeline
 
 
 @pytest.mark.parametrize(
     "settings, expected",
     [
         ({"max_num_iterations": 0}, "--max-num-iterations 0: at least 1"),
+        ({"schedule_iterations": 0}, "--schedule-iterations 0: at least 1"),
+        ({"machine": replace(sl_neus.config.machine, seed=-1)}, "--machine.seed -1: give a number from 0"),
+        ({"pipeline": without_rays()}, "train-num-rays-per-batch 0"),
+        ({"timestamp": "../../../escaped"}, "is not the name of a folder inside"),
+        ({"experiment_name": ""}, "--experiment-name '': is not the name of a folder"),
         ({"load_dir": Path("nowhere")}, "--load-dir nowhere: no checkpoint step-*.ckpt there"),
         ({"load_checkpoint": Path("none.ckpt")}, "--load-checkpoint none.ckpt: no such file"),
         ({"machine": replace(sl_neus.config.machine, device_type="cpu", num_devices=2)}, "--machine.num-devices 2"),
@@ -99,34 +94,23 @@ def test_bad_scans_do_not_start(
         ({"data": None}, "no scan given. Add --data FOLDER"),
     ],
 )
-def test_bad_settings_do_not_start(
-    scan: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-    settings: dict[str, Any],
-    expected: str,
-) -> None:
-    assert expected in refused(tmp_path, monkeypatch, capfd, scan, **settings)
+def test_bad_settings_do_not_start(scan, refused, settings, expected) -> None:
+    assert expected in refused(scan, **settings)
 
 
-def test_a_truncated_checkpoint(
-    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_truncated_checkpoint(scan, tmp_path, refused) -> None:
     checkpoint = tmp_path / "step-000000005.ckpt"
     torch.save({"schedulers": {}, "weights": torch.zeros(1000)}, checkpoint)
     truncate(checkpoint)
-    message = refused(tmp_path, monkeypatch, capfd, scan, load_dir=tmp_path)
+    message = refused(scan, load_dir=tmp_path)
     assert message.startswith("error: ") and message.count("error: ") == 1
     assert "step-000000005.ckpt: cannot be read as a checkpoint" in message
 
 
-def test_other_dataparsers(
-    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_other_dataparsers(scan, refused) -> None:
     pipeline = copy.deepcopy(sl_neus.config.pipeline)
     pipeline.datamanager.dataparser = NerfstudioDataParserConfig()
-    message = refused(tmp_path, monkeypatch, capfd, scan, pipeline=pipeline)
+    message = refused(scan, pipeline=pipeline)
     assert message.startswith("error: sl-neus trains on scan folders only") and len(message.splitlines()) == 1
     assert "NerfstudioDataParser has no projector. Leave the dataparser out." in message
 
@@ -137,12 +121,8 @@ def test_the_command_itself_refuses_a_bad_scan(tmp_path: Path) -> None:
     root = TinyScan(frames=2).write(tmp_path / "scan")
     (root / "coords/frame_00001.npz").unlink()
     (tmp_path / "here").mkdir()
-    done = subprocess.run(
-        [str(Path(sys.executable).with_name("ns-train")), "sl-neus", "--data", str(root)],
-        cwd=tmp_path / "here",
-        capture_output=True,
-        text=True,
-    )
+    command = [Path(sys.executable).with_name("ns-train"), "sl-neus", "--data", root]
+    done = subprocess.run(command, cwd=tmp_path / "here", capture_output=True, text=True)
     assert done.returncode == 1
     assert "Traceback" not in done.stdout + done.stderr
     assert "coords/frame_00001.npz" in done.stderr and "remedy:" in done.stderr

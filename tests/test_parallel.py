@@ -136,9 +136,7 @@ def test_a_task_that_is_alone_has_all_threads() -> None:
 
 @pytest.mark.parametrize("used", [1, 3])
 @pytest.mark.parametrize("count", [0, 1, 11, 12, 13, 100])
-def test_tracked_results_are_in_order_and_their_progress_reaches_the_end(
-    monkeypatch: pytest.MonkeyPatch, used: int, count: int
-) -> None:
+def test_tracked_results_are_in_order_and_their_progress_reaches_the_end(monkeypatch, used, count):
     seen = []
 
     def track(batches: list[list[object]], words: str) -> Iterator[list[object]]:

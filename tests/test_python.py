@@ -86,9 +86,7 @@ def captures(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_photographs_become_coordinates_points_and_a_scan(
-    captures: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_photographs_become_coordinates_points_and_a_scan(captures, tmp_path, capsys):
     run_example(1, captures / "images" / "frame_00000.png", captures / "pattern.json")
     assert " pixels decoded, " in capsys.readouterr().out
     run_example(2, captures, tmp_path / "cloud.npy")

@@ -9,7 +9,7 @@ import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -43,6 +43,19 @@ def parse(kind: type[T], command: str, inputs: Mapping[str, str] | None = None, 
 def flag_name(field: str) -> str:
     """The flag of a field."""
     return "--" + field.replace("_", "-")
+
+
+def given_flags(config: Any, without: Collection[str] = ()) -> list[str]:
+    """The flags that give a configuration, for a command to copy, but for the fields `without`."""
+    words: list[str] = []
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.name in without or (field.default is not dataclasses.MISSING and value == field.default):
+            continue
+        words.append(flag_name(field.name))
+        if not isinstance(value, bool):
+            words += map(str, value if isinstance(value, tuple) else (value,))
+    return words
 
 
 # --help: required flags first, then groups; lines are as wide as the terminal.
@@ -142,6 +155,13 @@ def _values(hint: Any) -> str:
 
 SCAN = "give the folder that holds transforms.json"
 CONFIG = "give the config.yml that ns-train prints at the end: outputs/SCAN/sl-neus/DATE/config.yml"
+PHOTOGRAPHS = {
+    "pattern": "give the pattern.json that sl-pattern wrote, or the projector's resolution, as 1024x768",
+    "intrinsics": "give the file with the intrinsics; sl-calibrate makes one",
+    "masks": "give the folder with one mask for each frame",
+    "color": "give the folder with the photographs without the pattern",
+}
+"""What those flags should be that go with photographs."""
 
 
 def require_paths(paths: Mapping[str, tuple[Path | None, str]]) -> None:

@@ -2,11 +2,12 @@
 
 import shlex
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from sl_nerfstudio.cli.arguments import parse
+from sl_nerfstudio.cli.arguments import PHOTOGRAPHS, parse
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.console import command, next_steps, phase, say, track
 from sl_nerfstudio.errors import UserError
@@ -105,10 +106,7 @@ class CalibrateConfig:
             raise UserError(f"--{' --'.join(_FLAGS[self.board])}: {error}") from error
 
 
-_INPUTS = {
-    "images": "give the folder with the captures of the board",
-    "pattern": "give the pattern.json that sl-pattern wrote, or the projector's resolution, as 1024x768",
-}
+_INPUTS = {"images": "give the folder with the captures of the board", "pattern": PHOTOGRAPHS["pattern"]}
 _GROUPS = {
     "the board": ("board", "corners", "squares", "square", "marker", "dictionary"),
     "the projector": ("pattern", "sequence", "projector_model", "camera_only"),
@@ -168,15 +166,11 @@ def _photographs(config: CalibrateConfig) -> "Captures":
     from sl_nerfstudio.calibration.board import FEWEST_VIEWS
     from sl_nerfstudio.processing.captures import find_captures
 
-    single = config.camera_only and any(path.is_file() for path in _content(config))
+    single = False
+    if config.camera_only:
+        with suppress(OSError):  # said by find_captures
+            single = any(path.is_file() for path in config.images.iterdir() if not path.name.startswith("."))
     return find_captures(config.images, not single, needs=f"a calibration needs {FEWEST_VIEWS} poses at least")
-
-
-def _content(config: CalibrateConfig) -> list[Any]:
-    try:
-        return [path for path in config.images.iterdir() if not path.name.startswith(".")]
-    except OSError:
-        return []  # said by find_captures
 
 
 def _decoder(config: CalibrateConfig, found: "Captures") -> "Decoder[Any]":

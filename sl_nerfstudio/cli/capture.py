@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from sl_nerfstudio.cli.arguments import parse, require_paths
 from sl_nerfstudio.cli.run import Terminated, run
-from sl_nerfstudio.console import command, next_steps
+from sl_nerfstudio.console import command, next_steps, say
 from sl_nerfstudio.errors import UserError
 
 if TYPE_CHECKING:
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from sl_nerfstudio.capture.capture import CapturedSequence, SequenceProgress
     from sl_nerfstudio.capture.screen import Screen, Watcher
     from sl_nerfstudio.capture.selection import Exposure, GridView, Selection, SelectionVerdict
-    from sl_nerfstudio.decoding.decoder import DecodingError
     from sl_nerfstudio.pattern.gray_code import GrayCode
     from sl_nerfstudio.pattern.grid import GridPattern
 
@@ -185,11 +184,6 @@ def decoded_words(progress: "SequenceProgress", name: str, captured: "CapturedSe
     )
 
 
-def failed_words(error: "DecodingError") -> str:
-    """A sequence was not kept."""
-    return f"  not kept: this sequence {error}"
-
-
 def coverage_words(frames: int, output: Path, times_seen: 'Int[ndarray, "rows columns"]') -> str:
     """The summary at the end."""
     from sl_nerfstudio.capture.camera import share_seen
@@ -198,9 +192,8 @@ def coverage_words(frames: int, output: Path, times_seen: 'Int[ndarray, "rows co
         return f"no frame was kept, so {output} was not written"
     text = f"{frames} frame{'s' if frames != 1 else ''} in {output}"
     if times_seen.size:
-        text += (
-            f"; they show {share_seen(times_seen):.0%} of the pattern, {share_seen(times_seen, _OFTEN):.0%} three times"
-        )
+        often = share_seen(times_seen, _OFTEN)
+        text += f"; they show {share_seen(times_seen):.0%} of the pattern, {often:.0%} three times"
         if frames < _USUAL_LEAST:
             text += f"\na scan usually takes {_USUAL_LEAST} frames or more: run the same command again to go on"
     return text
@@ -213,18 +206,12 @@ def _light_words(light: "Exposure") -> str:
 # What sl-capture sets up for each kind of pattern, and what it says at the end.
 
 
-def say(text: str) -> None:
-    """A line on the console, at once."""
-    print(text, flush=True)
-
-
 def capture(config: CaptureConfig) -> None:
     """Capture until it is ended, then say what to do next. Raises UserError for what cannot be captured."""
     config.check()
     if not config.camera.isdigit():
-        require_paths(
-            {"--camera": (Path(config.camera), "give the number of a camera (0 is the first), or a video file")}
-        )
+        remedy = "give the number of a camera (0 is the first), or a video file"
+        require_paths({"--camera": (Path(config.camera), remedy)})
     from sl_nerfstudio.capture.camera import open_camera
     from sl_nerfstudio.pattern.files import read_layout
     from sl_nerfstudio.pattern.gray_code import GrayCode
@@ -270,12 +257,7 @@ def _single_images(config: CaptureConfig, source: "Camera | Video", layout: "Gri
 
 def _sequences(config: CaptureConfig, source: "Camera | Video", layout: "GrayCode") -> None:
     from sl_nerfstudio.capture.camera import CaptureFolder, Video
-    from sl_nerfstudio.capture.capture import (
-        CaptureRig,
-        capture_in_step,
-        resume_sequences,
-        start,
-    )
+    from sl_nerfstudio.capture.capture import CaptureRig, capture_in_step, resume_sequences, start
     from sl_nerfstudio.decoding.decoder import DecodingError
 
     if isinstance(source, Video):
@@ -295,8 +277,7 @@ def _sequences(config: CaptureConfig, source: "Camera | Video", layout: "GrayCod
         )
     progress = start(layout)
     with CaptureFolder(config.output, layout, source.size) as folder, _watcher(config) as (watcher, screen):
-        if screen is None:
-            raise RuntimeError("a display was given, but there is no screen")
+        assert screen is not None
         resume_sequences(folder, layout, progress)
         say(f"{_described(source)}; Space captures a sequence, Escape ends")
         words = partial(sequence_lines, layout.images)
@@ -304,7 +285,7 @@ def _sequences(config: CaptureConfig, source: "Camera | Video", layout: "GrayCod
         with _ended_by_control_c():
             for captured in capture_in_step(rig, progress, watcher, words, config.frames):
                 if isinstance(captured, DecodingError):
-                    say(failed_words(captured))
+                    say(f"  not kept: this sequence {captured}")
                 else:
                     path = folder.add_sequence(captured.images)
                     progress.add(captured.decoded, layout, captured.images[0])
@@ -357,11 +338,8 @@ def _next_command(config: CaptureConfig) -> str:
 
 def main() -> None:
     """Entry point of the command."""
-    run(
-        lambda: capture(
-            parse(CaptureConfig, "sl-capture", {"pattern": "give the pattern.json that sl-pattern wrote"}, _GROUPS)
-        )
-    )
+    inputs = {"pattern": "give the pattern.json that sl-pattern wrote"}
+    run(lambda: capture(parse(CaptureConfig, "sl-capture", inputs, _GROUPS)))
 
 
 if __name__ == "__main__":

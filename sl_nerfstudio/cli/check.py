@@ -17,7 +17,6 @@ from sl_nerfstudio.console import phase, unit_word
 if TYPE_CHECKING:
     from sl_nerfstudio.review.agreement import CrossFrameAgreement
     from sl_nerfstudio.review.verdict import Help
-    from sl_nerfstudio.runs.run import RunCheck
     from sl_nerfstudio.scan.check import FolderCheck
 
 # The part of `sl-check` that checks a training run instead of a scan.
@@ -36,25 +35,18 @@ def check_run_folder(path: Path) -> str:
         warnings.simplefilter("ignore", FutureWarning)  # nerfstudio's own, at its import
         from sl_nerfstudio.runs.run import check_run
 
-    return run_summary(check_run(path))
-
-
-def run_summary(found: "RunCheck") -> str:
-    """The main facts about a good run, in a few lines."""
+    found = check_run(path)
     config, step, last = found.config, found.last.step, found.config.last_step
     state = "poses adjusted, no step yet" if step < 0 else f"step {step}"
     if last is not None:
         state += ", complete" if step >= last else f" of {last}: interrupted, or still in training"
     there = "is there and unchanged" if found.has_scan else "is not there, so it was not compared"
-    return "\n".join(
-        [
-            f"{found.folder}: no faults",
-            f"  method              {config.method_name}",
-            f"  state               {state}",
-            f"  checkpoints         {found.checkpoints}, the last is {found.last.path.name}",
-            f"  scan                {found.scan} {there}",
-            "",
-        ]
+    return (
+        f"{found.folder}: no faults\n"
+        f"  method              {config.method_name}\n"
+        f"  state               {state}\n"
+        f"  checkpoints         {found.checkpoints}, the last is {found.last.path.name}\n"
+        f"  scan                {found.scan} {there}\n"
     )
 
 

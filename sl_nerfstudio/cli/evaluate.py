@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -61,55 +61,51 @@ def _listed(name: str, lines: Sequence[str], rest: str) -> list[str]:
     return shown + ([paragraph("", f"({more} more {rest})")] if more else [])
 
 
-def print_tables(evaluation: "Evaluation") -> None:
-    """Print distances, pose errors and residuals as tables."""
+def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table; columns without a name are aligned to the left."""
     from rich.console import Console
     from rich.table import Table
 
-    console = Console()
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, justify="right" if column.strip() else "left")
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+def print_tables(evaluation: "Evaluation") -> None:
+    """Print distances, pose errors and residuals as tables."""
     units = evaluation.truth_units
     if evaluation.surface:
-        table = Table(title=f"Distances in {units}", title_justify="left")
-        for column in ("", " ", "mean", "median", "RMS", "95 %", "Chamfer", "scale"):
-            table.add_column(column, justify="right" if column.strip() else "left")
+        rows = []
         for name, score in evaluation.comparable.items():
             a, c = score.accuracy, score.completeness
             chamfer, scale = f"{score.chamfer:.3g}", f"{score.scale:.5f}"
-            table.add_row(name, "accuracy", *(f"{v:.3g}" for v in (a.mean, a.median, a.rmse, a.p95)), chamfer, scale)
-            table.add_row("", "completeness", *(f"{v:.3g}" for v in (c.mean, c.median, c.rmse, c.p95)), "", "")
-        console.print(table)
-    rows = [("initial poses", evaluation.initial_pose_errors), ("evaluated poses", evaluation.pose_errors)]
-    if any(errors for _, errors in rows):
-        table = Table(title=f"Pose errors, RMS, in {units}", title_justify="left")
-        for column in ("", "camera", "deg", "projector", "deg", "scale"):
-            table.add_column(column, justify="right" if column else "left")
-        for name, errors in rows:
-            if errors is not None:
-                values = [
-                    v for d in (errors.camera, errors.projector) for v in (d.translation_rmse, d.rotation_rmse_deg)
-                ]
-                table.add_row(name, *(f"{v:.3g}" for v in values), f"{100 * errors.scale_error:+.3f} %")
-        console.print(table)
+            rows += [
+                (name, "accuracy", *(f"{v:.3g}" for v in (a.mean, a.median, a.rmse, a.p95)), chamfer, scale),
+                ("", "completeness", *(f"{v:.3g}" for v in (c.mean, c.median, c.rmse, c.p95)), "", ""),
+            ]
+        columns = ("", " ", "mean", "median", "RMS", "95 %", "Chamfer", "scale")
+        print_table(f"Distances in {units}", columns, rows)
+    rows, poses = [], {"initial poses": evaluation.initial_pose_errors, "evaluated poses": evaluation.pose_errors}
+    for name, errors in poses.items():
+        if errors is not None:
+            both = (errors.camera, errors.projector)
+            values = [v for device in both for v in (device.translation_rmse, device.rotation_rmse_deg)]
+            rows.append((name, *(f"{v:.3g}" for v in values), f"{100 * errors.scale_error:+.3f} %"))
+    if rows:
+        print_table(f"Pose errors, RMS, in {units}", ("", "camera", "deg", "projector", "deg", "scale"), rows)
     agreement = evaluation.agreement
-    table = Table(title="Agreement with the captures", title_justify="left")
-    for column in (
-        "coordinates px (median)",
-        "95 %",
-        "epipolar px (median)",
-        "pattern cosine",
-        "covered",
-        "worst hole",
-    ):
-        table.add_column(column, justify="right")
-    table.add_row(
-        f"{agreement.coordinate_px_median:.3f}",
-        f"{agreement.coordinate_px_p95:.3f}",
-        f"{agreement.epipolar_px_median:.3f}",
-        f"{agreement.pattern_cosine:.4f}",
-        f"{agreement.hit_share:.1%}",
-        f"{max(frame.largest_hole for frame in agreement.frames):.1%}",
-    )
-    console.print(table)
+    figures = {
+        "coordinates px (median)": f"{agreement.coordinate_px_median:.3f}",
+        "95 %": f"{agreement.coordinate_px_p95:.3f}",
+        "epipolar px (median)": f"{agreement.epipolar_px_median:.3f}",
+        "pattern cosine": f"{agreement.pattern_cosine:.4f}",
+        "covered": f"{agreement.hit_share:.1%}",
+        "worst hole": f"{max(frame.largest_hole for frame in agreement.frames):.1%}",
+    }
+    print_table("Agreement with the captures", [*figures], [[*figures.values()]])
 
 
 # What sl-eval prints of the distances that were asked for.
@@ -117,23 +113,16 @@ def print_tables(evaluation: "Evaluation") -> None:
 
 def print_lengths(lengths: "Sequence[Length]", units: str) -> None:
     """A table, and why a distance has no uncertainty."""
-    from rich.console import Console
-    from rich.table import Table
-
     if not lengths:
         return
-
-    console = Console()
-    table = Table(title=f"Distances between points, in {units}", title_justify="left")
-    for column in ("", "distance", "1 sigma", "from poses", "from noise"):
-        table.add_column(column, justify="right" if column else "left")
+    rows = []
     for length in lengths:
         sigmas = (length.sigma, length.sigma_shared, length.sigma_independent)
-        table.add_row(length.name, f"{length.length:.5g}", *("-" if s is None else f"{s:.2g}" for s in sigmas))
-    console.print(table)
-    reasons = dict.fromkeys(filter(None, (why_unknown(length) for length in lengths)))
-    for reason in reasons:
-        console.print(f"  {reason}", highlight=False, soft_wrap=True, markup=False)
+        rows.append((length.name, f"{length.length:.5g}", *("-" if s is None else f"{s:.2g}" for s in sigmas)))
+    columns = ("", "distance", "1 sigma", "from poses", "from noise")
+    print_table(f"Distances between points, in {units}", columns, rows)
+    for reason in dict.fromkeys(filter(None, map(why_unknown, lengths))):
+        print(f"  {reason}")
 
 
 def why_unknown(length: "Length") -> str:
@@ -158,37 +147,27 @@ def print_inspection(
 
     Lengths times `factor` are in `unit`.
     """
-    from rich.console import Console
-    from rich.table import Table
-
     words = [] if placed is None else _place_words(placed, name, unit, factor)
     for line in [*words, *_inspection_notes(found, unit, factor)]:
         print(paragraph("part", line))
-    console = Console()
-    table = Table(title=f"Deviations from {name} in {unit}; outside is positive", title_justify="left")
-    for column in ("mean", "median", "RMS", "1 % below", "1 % above", "1 sigma (median)"):
-        table.add_column(column, justify="right")
+    columns = ("mean", "median", "RMS", "1 % below", "1 % above", "1 sigma (median)")
     values = (found.mean, found.median, found.rms, found.lowest, found.highest, found.median_sigma)
-    table.add_row(*("-" if v is None else f"{factor * v:.3g}" for v in values))
-    console.print(table)
+    row = ["-" if v is None else f"{factor * v:.3g}" for v in values]
+    print_table(f"Deviations from {name} in {unit}; outside is positive", columns, [row])
     if found.within is None or found.tolerance is None or found.out is None or found.undecided is None:
         return
-    table = Table(title=f"Tolerance ±{factor * found.tolerance:.4g} {unit}, of the measured area", title_justify="left")
-    for column in ("within", "undecided", "out of tolerance"):
-        table.add_column(column, justify="right")
-    table.add_row(*(f"{share:.2%}" for share in (found.within, found.undecided, found.out)))
-    console.print(table)
+    row = [f"{share:.2%}" for share in (found.within, found.undecided, found.out)]
+    title = f"Tolerance ±{factor * found.tolerance:.4g} {unit}, of the measured area"
+    print_table(title, ("within", "undecided", "out of tolerance"), [row])
     if not found.patches:
         return
-    table = Table(title=f"Out of tolerance, at x, y, z of {name}", title_justify="left")
-    for column in ("x, y, z", "mean", "largest", "1 sigma", "area"):
-        table.add_column(column, justify="right")
+    rows = []
     for patch in found.patches:
         sigma = "-" if patch.sigma is None else f"{factor * patch.sigma:.2g}"
         place = ", ".join(f"{factor * v:.4g}" for v in patch.place)
         heights = (f"{factor * v:+.3g}" for v in (patch.mean, patch.height))
-        table.add_row(place, *heights, sigma, f"{factor**2 * patch.area:.3g}")
-    console.print(table)
+        rows.append((place, *heights, sigma, f"{factor**2 * patch.area:.3g}"))
+    print_table(f"Out of tolerance, at x, y, z of {name}", ("x, y, z", "mean", "largest", "1 sigma", "area"), rows)
 
 
 def _place_words(placed: "PartAlignment", name: str, unit: str, factor: float) -> list[str]:
@@ -257,34 +236,23 @@ def _inspection_notes(found: "Inspection", unit: str, factor: float) -> list[str
 
 def print_fits(fits: "Sequence[FittedShape]", unit: str) -> None:
     """A table of fitted shapes, each value with its 1 sigma."""
-    from rich.console import Console
-    from rich.table import Table
-
     if not fits:
         return
-    console = Console()
-    table = Table(title=f"Fitted shapes, in {unit} and the mesh's axes (± 1 sigma)", title_justify="left")
-    for column in ("", "shape", "diameter", "centre", "direction", "form (RMS)"):
-        table.add_column(column, justify="right" if column else "left")
+    rows = []
     for fit in fits:
         diameter = "-" if fit.radius is None else f"{2 * fit.radius:.6g} ± {2 * (fit.sigma_radius or 0):.2g}"
-        direction = "-" if fit.direction is None else _unit_vector(fit.direction)
+        direction = "-" if fit.direction is None else ", ".join(f"{round(x, 4) + 0.0:g}" for x in fit.direction)
         turn = "" if fit.sigma_direction_deg is None else f" ± {fit.sigma_direction_deg:.2g}°"
         centre = f"{', '.join(f'{v:.5g}' for v in fit.point)} ± {fit.sigma_point:.2g}"
-        table.add_row(fit.region.name, fit.region.kind, diameter, centre, direction + turn, f"{fit.rms:.2g}")
-    console.print(table)
+        rows.append((fit.region.name, fit.region.kind, diameter, centre, direction + turn, f"{fit.rms:.2g}"))
+    columns = ("", "shape", "diameter", "centre", "direction", "form (RMS)")
+    print_table(f"Fitted shapes, in {unit} and the mesh's axes (± 1 sigma)", columns, rows)
     if any(fit.radius is not None and not fit.shared for fit in fits):
-        print(
-            paragraph(
-                "fits",
-                "diameters: sigma has what the surface shows, not the errors of poses and intrinsics; for those give "
-                "mesh.ply of sl-export, and --poses with the folder that the same sl-export wrote",
-            )
+        said = (
+            "diameters: sigma has what the surface shows, not the errors of poses and intrinsics; for those give "
+            "mesh.ply of sl-export, and --poses with the folder that the same sl-export wrote"
         )
-
-
-def _unit_vector(v: Sequence[float]) -> str:
-    return ", ".join(f"{round(x, 4) + 0.0:g}" for x in v)
+        print(paragraph("fits", said))
 
 
 # By which earlier results are known.

@@ -3,11 +3,11 @@
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from sl_nerfstudio.cli.arguments import CONFIG, SCAN, flag_name, parse
+from sl_nerfstudio.cli.arguments import CONFIG, SCAN, given_flags, parse
 from sl_nerfstudio.cli.run import load_run, run
 from sl_nerfstudio.console import command, fitted, next_steps, phase, short_path, unit_word
 from sl_nerfstudio.errors import UserError
@@ -78,18 +78,6 @@ class ExportConfig:
         """The files with the refined poses and with the training, if they are to be written."""
         folder = self.pose_folder
         return () if folder is None else (folder / "transforms.json", folder / "training.json")
-
-    def words(self) -> list[str]:
-        """The flags that give this configuration, for a command to copy."""
-        words: list[str] = []
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if field.default is not MISSING and value == field.default:
-                continue
-            words.append(flag_name(field.name))
-            if not isinstance(value, bool):
-                words += map(str, value if isinstance(value, tuple) else (value,))
-        return words
 
     def settings(self, units: str) -> "ExportSettings":
         """The export that is asked for, of a scan whose lengths are in `units`."""
@@ -245,20 +233,13 @@ def _place(path: Path, overwrite: bool) -> Iterator[str]:
         yield f"{path}: cannot be written, {folder} {problem}\n    remedy: choose another output"
 
 
-def require_other_files(paths: tuple[Path, ...], scan: Path) -> None:
-    """Raise UserError if poses would replace the scan's own."""
-    for path in paths:
-        if path.resolve() == (scan / path.name).resolve():
-            raise UserError(
-                f"{path}: is the scan's own file\n    remedy: give --poses another folder, such as refined/"
-            )
-
-
 # What sl-export prints: what was written, what was removed or invented, and what to do next.
 
 _SUSPICIOUS_PX = 3.0
 _LONG_SECONDS = 15.0
 _SAME_EXPOSURE = 1.02
+_TURNED = {"z-up": "up for the cameras is +z", "plane": "it stands on z = 0, about the origin"}
+_SOLID = "  a closed solid; what nobody saw ends flat at the convex hull of what was seen"
 
 
 def summary(config: ExportConfig, scan: "Scan", exported: "Exported") -> str:
@@ -274,11 +255,11 @@ def description(config: ExportConfig, scan: "Scan", exported: "Exported") -> str
     lines = [
         f"{config.output}: {len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles, {extent} {unit}",
         *_file_unit(config.output, scan.units),
-        *_axes(config),
-        *(_solid(exported) if config.watertight else _removed(surface)),
+        *([] if config.align is None else [f"  turned: {_TURNED[config.align]}"]),
+        *([_SOLID, *_agreement(surface)] if config.watertight else _removed(surface)),
         *_filled(config, surface, unit),
         *_cut(config, surface, unit),
-        *_pieces(config, surface),
+        *([f"  --largest-component removed {surface.other_pieces:,} other pieces"] if config.largest_component else []),
         *_invented(config, exported),
         *_decimated(exported, unit),
         *(_colours(exported) if exported.textured is None else _texture_words(exported, exported.textured, unit)),
@@ -299,7 +280,7 @@ def _next(config: ExportConfig, scan: "Scan", exported: "Exported") -> list[str]
     steps, poses = [], config.pose_files[:1]
     if exported.poses_refined and not poses:
         again = replace(config, poses=_new_folder(config.output), overwrite=True)
-        steps.append(command("sl-export", *again.words()))
+        steps.append(command("sl-export", *given_flags(again)))
         poses = again.pose_files[:1]
     given = ("--mesh", config.output, "--data", short_path(scan.root), *(("--poses", poses[0]) if poses else ()))
     return [next_steps([*steps, command("sl-eval", *given, "--report", "report.html")])]
@@ -324,35 +305,24 @@ def _file_unit(path: Path, units: str) -> list[str]:
     return [f"  written in {word}s{scaled}{f' ({note})' if note else ' (STL states no unit itself)'}"]
 
 
-def _axes(config: ExportConfig) -> list[str]:
-    turned = {"z-up": "up for the cameras is +z", "plane": "it stands on z = 0, about the origin"}
-    return [] if config.align is None else [f"  turned: {turned[config.align]}"]
-
-
-def _solid(exported: "Exported") -> list[str]:
-    return [
-        "  a closed solid; what nobody saw ends flat at the convex hull of what was seen",
-        *_agreement(exported.surface),
-    ]
-
-
 def _removed(surface: "ExtractedSurface") -> list[str]:
     trimmed = surface.trimmed
     if trimmed is None:
         return ["  nothing was removed: parts that no frame observed are invented by the field"]
-    gone = [
-        f"{count:,} {what}"
-        for count, what in (
-            (trimmed.unseen, "vertices that no frame saw"),
-            (trimmed.contradicted, "that frames contradict"),
-            (trimmed.loose_pieces, "loose piece" if trimmed.loose_pieces == 1 else "loose pieces"),
-        )
-        if count
-    ]
-    lines = [f"  removed, of {trimmed.total:,} vertices: {', '.join(gone) or 'nothing'} (--keep-unobserved keeps them)"]
+    gone = _counted(
+        (trimmed.unseen, "vertices that no frame saw"),
+        (trimmed.contradicted, "that frames contradict"),
+        (trimmed.loose_pieces, "loose piece" if trimmed.loose_pieces == 1 else "loose pieces"),
+    )
+    lines = [f"  removed, of {trimmed.total:,} vertices: {gone or 'nothing'} (--keep-unobserved keeps them)"]
     if trimmed.closed:
         lines.append(f"  kept, though no frame observed them: {trimmed.closed:,} vertices in small gaps")
     return [*lines, *_agreement(surface)]
+
+
+def _counted(*counts: tuple[int, str]) -> str:
+    """What there is of several things, but for those of which there is nothing."""
+    return ", ".join(f"{count:,} {what}" for count, what in counts if count)
 
 
 def _agreement(surface: "ExtractedSurface") -> list[str]:
@@ -374,12 +344,8 @@ def _filled(config: ExportConfig, surface: "ExtractedSurface", unit: str) -> lis
         f"  --fill-holes closed {filled.closed:,} holes of up to {limit} with the field's surface "
         f"({filled.area:.3g} square {unit})"
     ]
-    still = [
-        f"{count:,} {what}"
-        for count, what in ((filled.too_large, "that are larger"), (filled.denied, "that frames look through"))
-        if count
-    ]
-    return lines + ([f"    holes that stay open: {', '.join(still)}"] if still else [])
+    still = _counted((filled.too_large, "that are larger"), (filled.denied, "that frames look through"))
+    return lines + ([f"    holes that stay open: {still}"] if still else [])
 
 
 def _cut(config: ExportConfig, surface: "ExtractedSurface", unit: str) -> list[str]:
@@ -397,12 +363,6 @@ def _cut(config: ExportConfig, surface: "ExtractedSurface", unit: str) -> list[s
     if config.watertight and cut.removed:
         lines = [f"  --object-only cut the solid off flat at {len(cut.removed)} planes around the object"]
     return lines + [f"    {plane_sentence(plane, plane in cut.removed)}" for plane in cut.planes]
-
-
-def _pieces(config: ExportConfig, surface: "ExtractedSurface") -> list[str]:
-    if not config.largest_component:
-        return []
-    return [f"  --largest-component removed {surface.other_pieces:,} other pieces"]
 
 
 def _invented(config: ExportConfig, exported: "Exported") -> list[str]:
@@ -484,7 +444,9 @@ def _other_files(config: ExportConfig, scan: "Scan", exported: "Exported", unit:
     lines = []
     if config.points is not None:
         lines.append(f"{config.points}: {exported.points:,} points that frames confirm, with normals, sigma and views")
-        lines += _las_unit(config.points, scan.units)
+        if config.points.suffix.lower() == ".las":
+            arbitrary = "  one of the scan's arbitrary units became one metre"
+            lines.append(arbitrary if scan.units == "arbitrary" else "  written in metres")
     sigma = exported.pose_sigma
     if config.pose_files:
         known = ""
@@ -501,12 +463,6 @@ def _other_files(config: ExportConfig, scan: "Scan", exported: "Exported", unit:
     for kind, paths in config.settings(scan.units).device_files.items():
         lines += [f"{paths[0].parent}: {', '.join(path.name for path in paths)}", f"  {notes[kind]}"]
     return lines
-
-
-def _las_unit(path: Path, units: str) -> list[str]:
-    if path.suffix.lower() != ".las":
-        return []
-    return ["  one of the scan's arbitrary units became one metre" if units == "arbitrary" else "  written in metres"]
 
 
 def _rms(values: "ndarray") -> float:
@@ -542,7 +498,11 @@ def export_trained(trained: "TrainedRun", config: ExportConfig) -> "Exported":
     from sl_nerfstudio.runs.export import export_run
 
     scan = trained.model.scan
-    require_other_files(config.pose_files, scan.root)
+    for path in config.pose_files:
+        if path.resolve() == (scan.root / path.name).resolve():
+            raise UserError(
+                f"{path}: is the scan's own file\n    remedy: give --poses another folder, such as refined/"
+            )
     return export_run(trained, config.settings(scan.units))
 
 

@@ -201,13 +201,12 @@ def _words(display: int, screen: tuple[int, int], size: tuple[int, int]) -> str:
 
 
 Kind = Literal["grid", "gray-code", "chessboard", "charuco"]
-_GRID_FLAGS = ("preset", "width", "height", "period", "line_width", "gap", "seed", "print_width")
-_BOARD_FLAGS = ("print_width", "square")
+_SIZE_FLAGS = ("preset", "width", "height")
 _FLAGS = {
-    "grid": _GRID_FLAGS,
-    "gray-code": ("preset", "width", "height", "cell", "sequence", "print_width"),
-    "chessboard": (*_BOARD_FLAGS, "corners"),
-    "charuco": (*_BOARD_FLAGS, "squares", "marker", "dictionary"),
+    "grid": (*_SIZE_FLAGS, "period", "line_width", "gap", "seed", "print_width"),
+    "gray-code": (*_SIZE_FLAGS, "cell", "sequence", "print_width"),
+    "chessboard": ("print_width", "square", "corners"),
+    "charuco": ("print_width", "square", "squares", "marker", "dictionary"),
 }
 
 
@@ -274,18 +273,7 @@ class PatternArguments:
 
 
 _HELP_GROUPS = {
-    "patterns to project": (
-        "kind",
-        "preset",
-        "width",
-        "height",
-        "period",
-        "line_width",
-        "gap",
-        "seed",
-        "cell",
-        "sequence",
-    ),
+    "patterns to project": ("kind", *_SIZE_FLAGS, "period", "line_width", "gap", "seed", "cell", "sequence"),
     "boards to print": ("corners", "squares", "square", "marker", "dictionary", "print_width"),
     "on a display": ("show", "every"),
 }
@@ -322,12 +310,7 @@ def _next(arguments: PatternArguments) -> str:
 
 def _layout(arguments: PatternArguments, display: tuple[int, int] | None = None) -> "PatternLayout":
     """The pattern that the flags describe; without a size, that of the display, which is otherwise the preset's."""
-    from sl_nerfstudio.pattern.files import (
-        DEFAULT_PRESET,
-        longer_period,
-        make_gray_code,
-        make_grid,
-    )
+    from sl_nerfstudio.pattern.files import DEFAULT_PRESET, longer_period, make_gray_code, make_grid
 
     a = arguments
     w, h, period = a.width, a.height, a.period

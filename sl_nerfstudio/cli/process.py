@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from sl_nerfstudio.cli.arguments import parse
+from sl_nerfstudio.cli.arguments import PHOTOGRAPHS, parse
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.console import command, next_steps, phase, say
 from sl_nerfstudio.processing.config import ProcessConfig
@@ -14,11 +14,8 @@ if TYPE_CHECKING:
 
 _INPUTS = {
     "images": "give the folder with the captures",
-    "pattern": "give the pattern.json that sl-pattern wrote, or the projector's resolution, as 1024x768",
-    "intrinsics": "give the file with the intrinsics; sl-calibrate makes one",
-    "projector_intrinsics": "give the file with the intrinsics; sl-calibrate makes one",
-    "masks": "give the folder with one mask for each frame",
-    "color": "give the folder with the photographs without the pattern",
+    **PHOTOGRAPHS,
+    "projector_intrinsics": PHOTOGRAPHS["intrinsics"],
     "poses": "give a transforms.json with rough poses",
 }
 _GROUPS = {
@@ -65,9 +62,10 @@ def findings(result: "ProcessResult", what: str = "") -> str:
     reasons = "".join(f"  {reason}\n" for reason in result.verdict.reasons)
     scale = f"lengths in {result.units} ({result.scale_source})"
     if not result.scale_source:
+        some = next((frame.name for frame in result.frames if frame.in_scan), "0")
         scale = (
             "no length is known: the same command with\n"
-            f"{command('--known-length', f'baseline of frame {_some_frame(result)} = 85 mm', indent='    ')}\n"
+            f"{command('--known-length', f'baseline of frame {some} = 85 mm', indent='    ')}\n"
             "    (as you measure it) adds one in seconds"
         )
     return (
@@ -75,11 +73,6 @@ def findings(result: "ProcessResult", what: str = "") -> str:
         f"wrote {result.registered} of {len(result.frames)} frames to {output}, {scale}\n{''.join(lost)}"
         f"report: {output / 'processing.html'}"
     )
-
-
-def _some_frame(result: "ProcessResult") -> str:
-    """A frame of the scan, by its name."""
-    return next((frame.name for frame in result.frames if frame.in_scan), "0")
 
 
 if __name__ == "__main__":

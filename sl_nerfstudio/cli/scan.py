@@ -8,14 +8,14 @@ import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, nullcontext
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from sl_nerfstudio.cli.arguments import flag_name, parse
+from sl_nerfstudio.cli.arguments import PHOTOGRAPHS, flag_name, given_flags, parse
 from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.console import command, duration, next_steps, paragraph, phase, say, short_path
 from sl_nerfstudio.errors import UserError
@@ -81,13 +81,8 @@ class ScanConfig:
     @property
     def words(self) -> list[str]:
         """The words of this command, to copy and for the record; without `--preview`, on which no result depends."""
-        found = ["sl-scan", *([] if self.photographs is None else [str(self.photographs)])]
-        plain = replace(self, preview=False, share=False)
-        for field in fields(plain)[1:]:
-            value = getattr(plain, field.name)
-            if field.default is MISSING or value != field.default:
-                found += [flag_name(field.name), *([] if value is True else [str(value)])]
-        return found
+        photographs = [] if self.photographs is None else [str(self.photographs)]
+        return ["sl-scan", *photographs, *given_flags(self, without=("photographs", "preview", "share"))]
 
     @property
     def better(self) -> "ScanConfig | None":
@@ -167,13 +162,7 @@ class ScanConfig:
         )  # fmt: skip
 
 
-_INPUTS = {
-    "photographs": "give the folder with the photographs, or a scan folder",
-    "pattern": "give the pattern.json that sl-pattern wrote, or the projector's resolution, as 1024x768",
-    "intrinsics": "give the file with the intrinsics; sl-calibrate makes one",
-    "masks": "give the folder with one mask for each frame",
-    "color": "give the folder with the photographs without the pattern",
-}
+_INPUTS = {"photographs": "give the folder with the photographs, or a scan folder", **PHOTOGRAPHS}
 _GROUPS = {
     "photographs": ("pattern", "intrinsics", "known_length", "masks", "color", "full_size"),
     "the scan": ("rig", "object_only", "quality"),

@@ -8,7 +8,6 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float, Float32, Int, Shaped, UInt8
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.configs.dataparser_configs import AnnotatedDataParserUnion
 from nerfstudio.data.datamanagers.base_datamanager import VanillaDataManager, VanillaDataManagerConfig
@@ -25,9 +24,7 @@ from sl_nerfstudio.dataparser.dataparser import (
     SLDataParserConfig,
     held_out_pixels,
 )
-from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Intrinsics
-from sl_nerfstudio.geometry.numerics import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import pixel_rays
 from sl_nerfstudio.scan import Frame, Scan
 
@@ -265,14 +262,6 @@ class SLDataManager(VanillaDataManager[SLDataset]):
     train_pixel_sampler: SLPixelSampler
     eval_pixel_sampler: SLPixelSampler
 
-    def __init__(self, config: SLDataManagerConfig, **kwargs: Any) -> None:
-        if not isinstance(config.dataparser, SLDataParserConfig):
-            raise UserError(
-                f"{type(config.dataparser).__name__} does not describe a projector: this method trains on scan folders "
-                "only. Leave the dataparser out, or name `sl-data`."
-            )
-        super().__init__(config, **kwargs)
-
     @property
     def samples(self) -> PixelSamples:
         """All masked pixels of the scan."""
@@ -322,10 +311,7 @@ class SLDataManager(VanillaDataManager[SLDataset]):
 
     def held_out_batch(self, frame: int, count: int) -> tuple[RayBundle, Batch]:
         """Return up to `count` of one frame's held-out pixels, evenly spread; possibly none."""
-        index = self._samples.held_out_of(frame)
-        if len(index) > count:
-            index = index[torch.from_numpy(evenly_spaced(len(index), count)).to(index.device)]
-        return self._rays_and_batch(self._samples.at(index))
+        return self._rays_and_batch(self._samples.held_out_of(frame, count))
 
     def stand_at(self, T_scene_camera: Float[Tensor, "n 4 4"]) -> None:
         """Use refined poses for all cameras and rays, and mark them, so that the model does not correct them again.
@@ -336,7 +322,10 @@ class SLDataManager(VanillaDataManager[SLDataset]):
         outputs = (self.train_dataparser_outputs, self.eval_dataset._dataparser_outputs)
         loaders = [getattr(self, name, None) for name in ("fixed_indices_eval_dataloader", "eval_dataloader")]
         for holder in (*outputs, self.train_dataset, self.eval_dataset, *filter(None, loaders)):
-            _stand_at(holder.cameras, T_scene_camera)
+            cameras = holder.cameras
+            cameras.camera_to_worlds = T_scene_camera[:, :3].to(cameras.camera_to_worlds)
+            refined = torch.ones_like(cameras.width, dtype=torch.bool)
+            cameras.metadata = {**(cameras.metadata or {}), "sl_refined": refined}
         if hasattr(self, "scene_rays"):
             self.scene_rays = SceneRays(self.dataparser.loaded.scan, T_scene_camera, refined=True)
 
@@ -356,8 +345,3 @@ class SLDataManager(VanillaDataManager[SLDataset]):
             "mask": torch.ones_like(pattern, dtype=torch.bool),
         }
         return self.scene_rays(pixels.frame, pixels.uv), batch
-
-
-def _stand_at(cameras: Cameras, T_scene_camera: Float[Tensor, "n 4 4"]) -> None:
-    cameras.camera_to_worlds = T_scene_camera[:, :3].to(cameras.camera_to_worlds)
-    cameras.metadata = {**(cameras.metadata or {}), "sl_refined": torch.ones_like(cameras.width, dtype=torch.bool)}

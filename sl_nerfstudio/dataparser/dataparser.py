@@ -112,17 +112,8 @@ def require_same_scan(root: Path, actual: str, stated: str | None, of_what: str)
 
 # Every masked pixel of a scan in one compact table, and random draws from it.
 
-_RECORD = np.dtype(
-    [
-        ("frame", "i4"),
-        ("coords", "f4", 2),
-        ("row", "i2"),
-        ("column", "i2"),
-        ("pattern", "f2"),
-        ("held_out", "?"),
-        ("", "V1"),
-    ]
-)  # what is known of a pixel lies together: a table that is in a file is read once for it
+_FIELDS = [("frame", "i4"), ("coords", "f4", 2), ("row", "i2"), ("column", "i2"), ("pattern", "f2"), ("held_out", "?")]
+_RECORD = np.dtype([*_FIELDS, ("", "V1")])  # a pixel's fields lie together: a table in a file is read once for them
 _AT_ONCE = 2**24  # pixels: bounds memory
 
 
@@ -221,12 +212,6 @@ class PixelSamples:
             return self
         return PixelSamples(self.records.to(device), self.first.to(device), self.held_out_index.to(device))
 
-    def first_frames(self, count: int) -> "PixelSamples":
-        """The pixels of the first frames alone."""
-        end = int(self.first[count])
-        held_out = self.held_out_index[self.held_out_index < end]
-        return PixelSamples(self.records[:end], self.first[: count + 1], held_out, self.in_file)
-
     def in_order(self) -> Iterator[PixelBatch]:
         """All pixels of each frame."""
         self._announce(read_in_order)
@@ -257,11 +242,16 @@ class PixelSamples:
         """Like `draw` for training, but in a fixed number of operations, so that the host need not wait for a GPU."""
         return self.training[self.randint(len(self.training), count, generator)].long()
 
-    def held_out_of(self, frame: int) -> Int[Tensor, "n"]:
-        """Indices of one frame's held-out pixels."""
-        first, last = int(self.first[frame]), int(self.first[frame + 1])
-        lower, upper = torch.searchsorted(self.held_out_index, torch.tensor([first, last], device=self.device))
-        return self.held_out_index[lower:upper]
+    def held_out_of(self, frame: int, most: int) -> PixelBatch:
+        """At most so many of one frame's held-out pixels, evenly spread."""
+        lower, upper = torch.searchsorted(self.held_out_index, self.first[frame : frame + 2])
+        index = self.held_out_index[lower:upper]
+        return self.at(index[torch.from_numpy(evenly_spaced(len(index), min(len(index), most))).to(self.device)])
+
+    def some_of(self, frame: int, most: int) -> PixelBatch:
+        """At most so many of one frame's pixels, evenly spread."""
+        first, last = self.first[frame : frame + 2].tolist()
+        return self.at(first + torch.from_numpy(evenly_spaced(last - first, min(last - first, most))))
 
     def at(self, index: Int[Tensor, "n"] | slice) -> PixelBatch:
         """The pixels with these indices."""
@@ -362,9 +352,7 @@ def triangulated_points(scan: Scan, samples: PixelSamples) -> tuple[Float[ndarra
     """World points of up to 1000 decoded pixels of each frame, and how many pixels were tried."""
     points, tried = [], 0
     for number, frame in enumerate(scan.frames):
-        first, last = int(samples.first[number]), int(samples.first[number + 1])
-        count = min(_POINTS_PER_FRAME, last - first)
-        pixels = samples.at(first + torch.from_numpy(evenly_spaced(last - first, count)))
+        pixels = samples.some_of(number, _POINTS_PER_FRAME)
         decoded = pixels.decoded
         count = int(decoded.sum())
         tried += count
@@ -436,7 +424,7 @@ class LoadedScan:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Identity of the scan, independent of its folder; see fingerprint.py."""
+        """Identity of the scan, independent of its folder; see `scan_fingerprint`."""
         return scan_fingerprint(self.scan)
 
 

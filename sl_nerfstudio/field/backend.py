@@ -1,7 +1,7 @@
 """The interface of an implementation of the field, and what the compiled one supports.
 
-An implementation evaluates the field inside and outside its box and pulls gradients back. It does not use autograd:
-`autograd.py` makes torch operations from it.
+An implementation evaluates the field inside and outside its box and pulls gradients back. It does not use autograd: the
+functions at the end make torch operations from it.
 """
 
 from dataclasses import dataclass
@@ -138,6 +138,20 @@ class FieldState:
 
 
 @dataclass(frozen=True)
+class Target:
+    """Which gradients of parameters a pull-back makes, and where it adds that of the table."""
+
+    parameters: bool
+    """Whether any parameter's gradient is needed."""
+    table: Float[Tensor, "rows f"] | None
+    """What the table's gradient is added to."""
+    marks: UInt8[Tensor, "marks"] | None
+    """Marks of the table's rows, if it is the persistent buffer."""
+    returned: Float[Tensor, "rows f"] | None
+    """The table's gradient, if the backward function returns it."""
+
+
+@dataclass(frozen=True)
 class Pulled:
     """The result of a pull-back; None for parts that were not requested."""
 
@@ -161,13 +175,11 @@ class FieldBackend(Protocol):
         p: Float[Tensor, "n 3"],
         g: Float[Tensor, "n"],
         points: bool,
-        parameters: bool,
-        table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "marks"] | None,
+        to: Target,
     ) -> Pulled:
         """Gradients of `sum g f(p)` with respect to the points and to the parameters, on request.
 
-        The table's gradient is added to `table_gradient`, and the rows written to are marked in `marks`.
+        The table's gradient is added to `to.table`, and the rows written to are marked in `to.marks`.
         """
         ...
 
@@ -177,16 +189,10 @@ class FieldBackend(Protocol):
         p: Float[Tensor, "n 3"],
         g: Float[Tensor, "n"],
         v: Float[Tensor, "n 3"],
-        table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "marks"] | None,
+        to: Target,
     ) -> tuple[Tensor, ...]:
         """MLP gradients of `sum g f(p) + v . grad f(p)`; the table's as in `pull_back`."""
         ...
-
-
-@dataclass(frozen=True)
-class Kept:
-    """What a `MergedBackend` keeps between an evaluation and its pull-back."""
 
 
 @runtime_checkable
@@ -198,20 +204,18 @@ class MergedBackend(Protocol):
 
     def evaluate_all(
         self, state: FieldState, p: Float[Tensor, "n 3"], first: int
-    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"], Kept]:
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"], Any]:
         """Values, gradients of the points from `first` on, and what the pull-back needs."""
         ...
 
     def pull_back_all(
         self,
         state: FieldState,
-        kept: Kept,
+        kept: Any,
         g: Float[Tensor, "n"],
         v: Float[Tensor, "k 3"],
         points: bool,
-        parameters: bool,
-        table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "marks"] | None,
+        to: Target,
     ) -> Pulled:
         """Gradients of `sum g f + v . grad f`, on request: by the points before `first`, and by the parameters.
 
@@ -241,30 +245,16 @@ def triton_cannot(table: Tensor) -> str | None:
 # The field as torch operations: values, and values with gradients, both differentiable once.
 
 
-@dataclass(frozen=True)
-class _Target:
-    """Where a backward pass stores the parameters' gradients."""
-
-    parameters: bool
-    """Whether any parameter's gradient is needed."""
-    table: Tensor | None
-    """What the table's gradient is added to."""
-    marks: Tensor | None
-    """Marks of the table's rows, if it is the persistent buffer."""
-    returned: Tensor | None
-    """The table's gradient, if the backward function returns it."""
-
-
-def _target(ctx: Any) -> _Target:
+def _target(ctx: Any) -> Target:
     table, *mlp = ctx.parameters
     table_wanted = wanted(table)
     if table_wanted == Wanted.NO:
-        return _Target(any(wanted(x) != Wanted.NO for x in mlp), None, None, None)
+        return Target(any(wanted(x) != Wanted.NO for x in mlp), None, None, None)
     buffer: TableGradient | None = ctx.buffer
     if table_wanted == Wanted.ACCUMULATED and buffer is not None:
-        return _Target(True, buffer.attach(table), buffer.marks, None)
+        return Target(True, buffer.attach(table), buffer.marks, None)
     fresh = torch.zeros_like(table)
-    return _Target(True, fresh, None, fresh)
+    return Target(True, fresh, None, fresh)
 
 
 Active = tuple[int, ...]  # numbers of the levels that are switched on
@@ -296,9 +286,7 @@ class _Value(torch.autograd.Function):
     def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
         p, state = _kept(ctx)
         to = _target(ctx)
-        result = ctx.backend.pull_back(
-            state, p, grad_outputs[0], ctx.needs_input_grad[3], to.parameters, to.table, to.marks
-        )
+        result = ctx.backend.pull_back(state, p, grad_outputs[0], ctx.needs_input_grad[3], to)
         return (None, None, None, result.points, None, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
 
 
@@ -318,7 +306,7 @@ class _ValueAndGradient(torch.autograd.Function):
         to = _target(ctx)
         mlp: tuple[Tensor | None, ...] = (None,) * len(state.mlp)
         if to.parameters:
-            mlp = ctx.backend.pull_back_gradient(state, p, *grad_outputs, to.table, to.marks)
+            mlp = ctx.backend.pull_back_gradient(state, p, *grad_outputs, to)
         return (None, None, None, None, None, None, to.returned, *mlp)
 
 
@@ -342,9 +330,7 @@ class _Merged(torch.autograd.Function):
         _, state = _kept(ctx)
         to = _target(ctx)
         g, v = (x.contiguous() for x in grad_outputs)
-        result = ctx.backend.pull_back_all(
-            state, ctx.kept, g, v, ctx.needs_input_grad[4], to.parameters, to.table, to.marks
-        )
+        result = ctx.backend.pull_back_all(state, ctx.kept, g, v, ctx.needs_input_grad[4], to)
         mlp = result.mlp or [None] * len(state.mlp)
         return (None, None, None, None, result.points, None, None, to.returned, *mlp)
 
@@ -357,7 +343,7 @@ def value(
     If there is a `buffer`, it is or becomes the table's `.grad`, and `backward()` adds to it.
     """
     if isinstance(backend, MergedBackend):
-        return _apply_merged(backend, buffer, state, p, len(p))[0]
+        return _apply(_Merged, backend, buffer, state, p, len(p))[0]
     return _apply(_Value, backend, buffer, state, p)
 
 
@@ -366,7 +352,7 @@ def value_and_gradient(
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
     """Values and gradients at `p`, both differentiable with respect to the parameters; `p` is a constant."""
     if isinstance(backend, MergedBackend):
-        return _apply_merged(backend, buffer, state, p.detach(), 0)
+        return _apply(_Merged, backend, buffer, state, p.detach(), 0)
     return _apply(_ValueAndGradient, backend, buffer, state, p.detach())
 
 
@@ -382,22 +368,14 @@ def value_and_last_gradients(
     Together, if the backend can, which saves launches on a GPU.
     """
     if isinstance(backend, MergedBackend):
-        return _apply_merged(backend, buffer, state, p, first)
+        return _apply(_Merged, backend, buffer, state, p, first)
     f, gradient = value_and_gradient(backend, buffer, state, p[first:])
     return torch.cat([value(backend, buffer, state, p[:first]), f]), gradient
 
 
-def _apply_merged(
-    backend: MergedBackend, buffer: TableGradient | None, state: FieldState, p: Tensor, first: int
-) -> tuple[Tensor, Tensor]:
-    p = p.to(state.table.dtype).contiguous()
-    with torch.autocast(p.device.type, enabled=False):
-        tensors = (p, state.places, state.level_weights, state.table, *state.mlp)
-        return _Merged.apply(backend, buffer, state.active, first, *tensors)
-
-
-def _apply(function: Any, backend: FieldBackend, buffer: TableGradient | None, state: FieldState, p: Tensor) -> Any:
+def _apply(function: Any, backend: Any, buffer: TableGradient | None, state: FieldState, p: Tensor, *first: int) -> Any:
     """Call an autograd function in the parameters' precision, even if mixed precision is switched on."""
     with torch.autocast(p.device.type, enabled=False):
-        tensors = (p.to(state.table.dtype), state.places, state.level_weights, state.table, *state.mlp)
-        return function.apply(backend, buffer, state.active, *tensors)
+        p = p.to(state.table.dtype).contiguous()
+        tensors = (p, state.places, state.level_weights, state.table, *state.mlp)
+        return function.apply(backend, buffer, state.active, *first, *tensors)

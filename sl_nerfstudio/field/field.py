@@ -122,8 +122,7 @@ class SDFField(nn.Module):
         self.encoding = HashGrid(layout)
         widths = [3 + layout.width] + [config.hidden] * HIDDEN_LAYERS + [1]
         self.mlp = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
-        self._torch = TorchField(layout, KNEE)
-        self._compiled: dict[str, FieldBackend | MergedBackend] = {}
+        self._backends: dict[str, FieldBackend | MergedBackend] = {"torch": TorchField(layout, KNEE)}
         self._start_as_sphere(SPHERE_RADIUS)
 
     def _start_as_sphere(self, radius: float) -> None:
@@ -140,7 +139,9 @@ class SDFField(nn.Module):
             start = torch.full((n + 1,), math.sqrt(math.pi / n), dtype=torch.float64)
             start[n] = -radius
             p = torch.rand(8192, 3) * 2 - 1
-            h = self._hidden(torch.cat([p, p.new_zeros(len(p), self.encoding.layout.width)], -1))
+            h = torch.cat([p, p.new_zeros(len(p), self.encoding.layout.width)], -1)
+            for layer in self.hidden:
+                h = knee(layer(h), KNEE)
             h = F.pad(h, (0, 1), value=1.0).double()
             wanted = p.double().norm(dim=-1) - radius
             normal = h.T @ h + 1e-3 * torch.eye(n + 1, dtype=torch.float64)
@@ -160,19 +161,9 @@ class SDFField(nn.Module):
         assert isinstance(layer, nn.Linear)
         return layer
 
-    def _hidden(self, h: Float[Tensor, "n w"]) -> Float[Tensor, "n hidden"]:
-        for layer in self.hidden:
-            h = knee(layer(h), KNEE)
-        return h
-
-    def set_level_weights(self, weights: Float[Tensor, "levels"]) -> None:
-        """Fade the grid's levels in, coarse to fine: one weight in [0, 1] per level."""
-        self.encoding.set_level_weights(weights)
-
     def sdf(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Signed distance; differentiable (once) with respect to the parameters and `p`."""
-        state = self._state()
-        return value(self._backend(), self._buffer(), state, p)
+        return value(*self._parts(), p)
 
     def forward_geonetwork(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
         """`sdf` as a column, under the name that `ns-export marching-cubes` uses."""
@@ -180,13 +171,7 @@ class SDFField(nn.Module):
 
     def sdf_and_gradient(self, p: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
         """Signed distance and its gradient, both differentiable with respect to the parameters; `p` is a constant."""
-        state = self._state()
-        return value_and_gradient(self._backend(), self._buffer(), state, p)
-
-    def _state(self) -> FieldState:
-        mlp = tuple(parameter for layer in (*self.hidden, self.last) for parameter in (layer.weight, layer.bias))
-        encoding = self.encoding
-        return FieldState(encoding.table, encoding.level_weights, mlp, encoding.places, encoding.active)
+        return value_and_gradient(*self._parts(), p)
 
     def sdf_and_last_gradients(
         self, p: Float[Tensor, "n 3"], first: int
@@ -195,8 +180,7 @@ class SDFField(nn.Module):
 
         On a GPU this takes half the launches of `sdf` and `sdf_and_gradient`.
         """
-        state = self._state()
-        return value_and_last_gradients(self._backend(), self._buffer(), state, p, first)
+        return value_and_last_gradients(*self._parts(), p, first)
 
     def obstacle(self, backend: Literal["numba", "triton"]) -> str | None:
         """Why a compiled backend cannot serve the field where it is, or None if it can."""
@@ -218,18 +202,18 @@ class SDFField(nn.Module):
             return "torch"
         raise UserError(f"{obstacle}; choose the backend auto or torch")
 
-    def _backend(self) -> FieldBackend | MergedBackend:
-        name = self.backend
-        if name == "torch":
-            return self._torch
-        if name not in self._compiled:
-            self._compiled[name] = _compiled(name, self.encoding.layout)
-        return self._compiled[name]
+    def _parts(self) -> tuple[FieldBackend | MergedBackend, TableGradient | None, FieldState]:
+        """What evaluates the field, what it needs, and the table's persistent gradient buffer.
 
-    def _buffer(self) -> TableGradient | None:
-        """The table's persistent gradient buffer, if there will be a gradient and compiled kernels write to it."""
-        wanted = torch.is_grad_enabled() and self.backend != "torch"
-        return TableGradient.of(self.encoding.table) if wanted else None
+        There is a buffer if there will be a gradient, and compiled kernels write to it.
+        """
+        name, encoding = self.backend, self.encoding
+        if name not in self._backends:
+            self._backends[name] = _compiled(name, encoding.layout)
+        buffer = TableGradient.of(encoding.table) if torch.is_grad_enabled() and name != "torch" else None
+        mlp = tuple(parameter for layer in (*self.hidden, self.last) for parameter in (layer.weight, layer.bias))
+        state = FieldState(encoding.table, encoding.level_weights, mlp, encoding.places, encoding.active)
+        return self._backends[name], buffer, state
 
 
 def _compiled(name: str, layout: GridLayout) -> FieldBackend | MergedBackend:

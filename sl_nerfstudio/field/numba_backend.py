@@ -8,11 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.field.backend import FieldState, Pulled
+from sl_nerfstudio.field.backend import FieldState, Pulled, Target
 from sl_nerfstudio.field.hash_grid import FEATURES, GridLayout
 from sl_nerfstudio.field.numba_grid import FIRST, POINTS, GridArrays, clamped, encode, inside, scatter_level
 from sl_nerfstudio.field.simd import contract, kernel, multiply, part
@@ -82,12 +82,6 @@ class Scratch(NamedTuple):
     """Adjoint of the encoded points."""
     ue: ndarray
     """Derivative of f with respect to the encoded points."""
-
-
-def make_scratch(depth: int, hidden: int, layers: int) -> Scratch:
-    """Buffers for a network of these sizes."""
-    width = {"e": depth, "e_dot": depth, "de": depth, "ue": depth, "jac": 3 * depth, "d": hidden, "d2": hidden}
-    return Scratch(**{k: np.zeros(POINTS * width.get(k, layers * hidden), np.float32) for k in Scratch._fields})
 
 
 @part
@@ -411,11 +405,6 @@ def pack_network(layout: GridLayout, state: FieldState, knee: float) -> Network:
     )
 
 
-def zero_gradients(network: Network) -> Weights:
-    """Gradients of the MLP, initially zero, for kernels to add to."""
-    return Weights(*(np.zeros_like(w) for w in network.weights))
-
-
 def unpack_gradients(
     layout: GridLayout, state: FieldState, network: Network, parts: list[Weights]
 ) -> tuple[Tensor, ...]:
@@ -468,14 +457,12 @@ class NumbaField:
         p: Float[Tensor, "n 3"],
         g: Float[Tensor, "n"],
         points: bool,
-        parameters: bool,
-        table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "marks"] | None,
+        to: Target,
     ) -> Pulled:
         """See `FieldBackend`; points whose `g` is negligible are left out."""
         heavy = _heavy(g)
         if heavy is not None:
-            some = self.pull_back(state, p[heavy], g[heavy], points, parameters, table_gradient, marks)
+            some = self.pull_back(state, p[heavy], g[heavy], points, to)
             dp = None if some.points is None else torch.zeros_like(p).index_copy_(0, heavy, some.points)
             return Pulled(dp, some.mlp)
         grid, network, xyz = self._packed(state, p)
@@ -483,24 +470,11 @@ class NumbaField:
         dp = np.empty((len(xyz) if points else 0, 3), np.float32)
 
         def work(sums: Weights, levels: np.ndarray, _: np.ndarray, offset: int, start: int, stop: int) -> None:
-            pull_back_fused(
-                grid,
-                network,
-                _scratch(network),
-                xyz,
-                start,
-                stop,
-                upstream,
-                sums,
-                levels,
-                offset,
-                parameters,
-                dp,
-                points,
-            )
+            outputs = (sums, levels, offset, to.parameters, dp, points)
+            pull_back_fused(grid, network, _scratch(network), xyz, start, stop, upstream, *outputs)
 
-        parts = self._sweep(grid, network, xyz, None, parameters, table_gradient, marks, work)
-        mlp = unpack_gradients(self.layout, state, network, parts) if parameters else None
+        parts = self._sweep(grid, network, xyz, None, to, work)
+        mlp = unpack_gradients(self.layout, state, network, parts) if to.parameters else None
         return Pulled(torch.from_numpy(dp) if points else None, mlp)
 
     def pull_back_gradient(
@@ -509,8 +483,7 @@ class NumbaField:
         p: Float[Tensor, "n 3"],
         g: Float[Tensor, "n"],
         v: Float[Tensor, "n 3"],
-        table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "marks"] | None,
+        to: Target,
     ) -> tuple[Tensor, ...]:
         """See `FieldBackend`."""
         grid, network, xyz = self._packed(state, p)
@@ -521,7 +494,7 @@ class NumbaField:
                 grid, network, _scratch(network), xyz, start, stop, upstream, direction, sums, levels, slopes, offset
             )
 
-        parts = self._sweep(grid, network, xyz, direction, True, table_gradient, marks, work)
+        parts = self._sweep(grid, network, xyz, direction, to, work)
         return unpack_gradients(self.layout, state, network, parts)
 
     def _packed(self, state: FieldState, p: Tensor) -> tuple[GridArrays, Network, np.ndarray]:
@@ -533,9 +506,7 @@ class NumbaField:
         network: Network,
         xyz: np.ndarray,
         direction: np.ndarray | None,
-        parameters: bool,
-        table_gradient: Tensor | None,
-        marks: Tensor | None,
+        to: Target,
         work: Callable[..., None],
     ) -> list[Weights]:
         """For each batch, run the MLP in parallel over ranges of points, then the table in parallel over levels.
@@ -545,32 +516,24 @@ class NumbaField:
         """
         batch = min(len(xyz), _BATCH)
         ranges = _ranges(batch)
-        sums = [zero_gradients(network) for _ in ranges]
-        levels = np.empty((self.layout.levels, batch if parameters else 0, FEATURES), np.float32)
+        sums = [Weights(*map(np.zeros_like, network.weights)) for _ in ranges]
+        levels = np.empty((self.layout.levels, batch if to.parameters else 0, FEATURES), np.float32)
         slopes = np.empty((self.layout.levels, 0 if direction is None else batch, FEATURES), np.float32)
         v = xyz if direction is None else direction
         on = [level for level in reversed(range(self.layout.levels)) if grid.weights[level]]
         for first in range(0, len(xyz), _BATCH):
             count = min(_BATCH, len(xyz) - first)
-            parallel(
-                [
-                    partial(work, part, levels, slopes, first, first + start, first + min(stop, count))
-                    for (start, stop), part in zip(ranges, sums, strict=True)
-                ]
-            )
-            if table_gradient is None:
+            of_ranges = [
+                partial(work, part, levels, slopes, first, first + start, first + min(stop, count))
+                for (start, stop), part in zip(ranges, sums, strict=True)
+            ]
+            parallel(of_ranges)
+            if to.table is None:
                 continue
-            gradient = table_gradient.numpy().reshape(-1)
-            touched = np.empty(self.layout.rows, np.uint8) if marks is None else marks.numpy()
-            parallel(
-                [
-                    partial(
-                        scatter_level,
-                        *(grid, level, xyz, first, count, levels, gradient, touched, v, slopes, direction is not None),
-                    )
-                    for level in on
-                ]
-            )
+            gradient = to.table.numpy().reshape(-1)
+            touched = np.empty(self.layout.rows, np.uint8) if to.marks is None else to.marks.numpy()
+            arrays = (xyz, first, count, levels, gradient, touched, v, slopes, direction is not None)
+            parallel([partial(scatter_level, grid, level, *arrays) for level in on])
         return sums
 
 
@@ -591,9 +554,11 @@ def _heavy(g: Float[Tensor, "n"]) -> Tensor | None:
 
 def _scratch(network: Network) -> Scratch:
     """This thread's buffers."""
-    sizes = (network.depth, network.hidden, network.layers)
+    depth, hidden, layers = sizes = (network.depth, network.hidden, network.layers)
     if getattr(_buffers, "sizes", None) != sizes:
-        _buffers.sizes, _buffers.scratch = sizes, make_scratch(*sizes)
+        width = {"e": depth, "e_dot": depth, "de": depth, "ue": depth, "jac": 3 * depth, "d": hidden, "d2": hidden}
+        arrays = {k: np.zeros(POINTS * width.get(k, layers * hidden), np.float32) for k in Scratch._fields}
+        _buffers.sizes, _buffers.scratch = sizes, Scratch(**arrays)
     return _buffers.scratch
 
 

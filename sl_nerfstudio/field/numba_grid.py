@@ -1,8 +1,4 @@
-"""Kernels over the marked rows of the table: clear a gradient, and Adam.
-
-A batch of points marks a small part of the rows, scattered throughout the table. Most of the time is spent waiting for
-memory, so the marked rows are listed first and prefetched before they are used.
-"""
+"""The feature grid in numba: encode points, scatter gradients; and over marked rows, clear a gradient, and Adam."""
 
 from typing import NamedTuple
 
@@ -12,8 +8,6 @@ from numpy import ndarray
 from sl_nerfstudio.field.hash_grid import FEATURES, PRIMES
 from sl_nerfstudio.field.simd import gather, gather_jacobian, kernel, part, prefetch, scatter, scatter_pair
 
-# The feature grid in numba: gather features and their Jacobian, scatter gradients; eight features per level.
-#
 # A chunk of points is encoded into `e` [POINTS, depth]: columns 0..2 the point, 3 the constant 1 (it carries the
 # first layer's bias), 4..7 zero, then the levels; `depth` is padded to a multiple of 16. The Jacobian `jac` [POINTS,
 # 3, depth] holds the derivatives of the level columns with respect to the three coordinates.
@@ -213,11 +207,8 @@ def scatter_level(grid, level, p, start, count, values, gradient, marks, v, slop
     flat, flat_slopes = values[level].reshape(-1), slopes[level].reshape(-1)
     for i in range(count):
         if i + _POINTS_AHEAD < count:
-            px, py, pz = (
-                p[start + i + _POINTS_AHEAD, 0],
-                p[start + i + _POINTS_AHEAD, 1],
-                p[start + i + _POINTS_AHEAD, 2],
-            )
+            ahead = start + i + _POINTS_AHEAD
+            px, py, pz = p[ahead, 0], p[ahead, 1], p[ahead, 2]
             prefetch(gradient, locate(clamped(px), clamped(py), clamped(pz), place)[0])
         px, py, pz = p[start + i, 0], p[start + i, 1], p[start + i, 2]
         corners, tx, ty, tz = locate(clamped(px), clamped(py), clamped(pz), place)
@@ -233,6 +224,9 @@ def scatter_level(grid, level, p, start, count, values, gradient, marks, v, slop
         for corner in corners:
             marks[corner // FEATURES] = 1
 
+
+# A batch of points marks a small part of the rows, scattered throughout the table. Most of the time is spent waiting
+# for memory, so the marked rows are listed first and prefetched before they are used.
 
 LIST = 1024
 """Rows listed at a time."""

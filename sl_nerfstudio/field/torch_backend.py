@@ -4,10 +4,10 @@ Sizes in comments: n points, l levels, f features, c corners (8), h hidden width
 """
 
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
-from sl_nerfstudio.field.backend import FieldState, Pulled
+from sl_nerfstudio.field.backend import FieldState, Pulled, Target
 from sl_nerfstudio.field.hash_grid import FEATURES, PRIMES, GridLayout
 
 # The feature grid in plain torch: the reference for tests of the fast versions, and the version that runs on GPUs.
@@ -139,9 +139,7 @@ class TorchField:
         p: Float[Tensor, "n 3"],
         g: Float[Tensor, "n"],
         points: bool,
-        parameters: bool,
-        table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "marks"] | None,
+        to: Target,
     ) -> Pulled:
         """See `FieldBackend`."""
         e, jac = self._encode(state, p, points)
@@ -150,11 +148,11 @@ class TorchField:
         dp = None
         if jac is not None:
             dp = g[:, None] * (torch.einsum("nda,nd->na", jac, h[0]) + _outside(p)[1])
-        if not parameters:
+        if not to.parameters:
             return Pulled(dp, None)
         d = [g[:, None] * x for x in u]
-        if table_gradient is not None:
-            self._scatter(state, p, g[:, None] * h[0], None, None, table_gradient)
+        if to.table is not None:
+            self._scatter(state, p, g[:, None] * h[0], None, None, to.table)
         grads = [x for d_layer, before in zip(d, a, strict=False) for x in (d_layer.T @ before, d_layer.sum(0))]
         return Pulled(dp, (*grads, (g @ a[-1])[None], g.sum()[None]))
 
@@ -164,8 +162,7 @@ class TorchField:
         p: Float[Tensor, "n 3"],
         g: Float[Tensor, "n"],
         v: Float[Tensor, "n 3"],
-        table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "marks"] | None,
+        to: Target,
     ) -> tuple[Tensor, ...]:
         """See `FieldBackend`: one reverse sweep through the pair (f, derivative of f in the direction v)."""
         e, jac = self._encode(state, p, True)
@@ -183,8 +180,8 @@ class TorchField:
             d = d * _slope(z[layer], self.knee) + bend
             grads = [d.T @ a[layer] + u[layer].T @ a_dot[layer], d.sum(0), *grads]
             d = d @ state.mlp[2 * layer].detach()
-        if table_gradient is not None:
-            self._scatter(state, p, d, h[0], v, table_gradient)
+        if to.table is not None:
+            self._scatter(state, p, d, h[0], v, to.table)
         return tuple(grads)
 
     def _scatter(

@@ -16,10 +16,10 @@ from typing import Any
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
-from sl_nerfstudio.field.backend import FieldState, Kept, Pulled
+from sl_nerfstudio.field.backend import FieldState, Pulled, Target
 from sl_nerfstudio.field.device_kernels import block, launch
 from sl_nerfstudio.field.hash_grid import FEATURES, PRIMES, GridLayout
 from sl_nerfstudio.field.triton_vectors import clamped, dot, length, minus, one_minus_exp, store, vector
@@ -277,7 +277,7 @@ def row_adam(
 
 
 @dataclass(frozen=True)
-class _Kept(Kept):
+class _Kept:
     """Of n points, k of them with gradients; h is the width of a hidden layer.
 
     Rows of values come first, then k rows for derivatives, which the pull-back fills where an evaluation does not.
@@ -331,16 +331,13 @@ class TritonField:
     def pull_back_all(
         self,
         state: FieldState,
-        kept: Kept,
+        kept: _Kept,
         g: Float[Tensor, "n"],
         v: Float[Tensor, "k 3"],
         points: bool,
-        parameters: bool,
-        table_gradient: Float[Tensor, "rows f"] | None,
-        marks: UInt8[Tensor, "marks"] | None,
+        to: Target,
     ) -> Pulled:
         """See `MergedBackend`."""
-        assert isinstance(kept, _Kept)
         p, first, n, k, z = kept.p, kept.first, len(kept.p), len(kept.p) - kept.first, kept.z
         weights, _ = _layers(state)
         last = len(z) - 1
@@ -361,23 +358,23 @@ class TritonField:
         for layer in reversed(range(len(z))):
             arrays = (upstream, g, z[layer], kept.h[layer], z_dot[layer], rows.knee, d[layer], by_bias[layer])
             rows.launch(adjoint, n, *arrays, by_last, sums[-1:], n, first, TOP=layer == last)
-            if parameters:
+            if to.parameters:
                 by_weight.insert(0, torch.mm(d[layer].T, kept.inputs[layer]))
             if layer:
                 upstream = torch.mm(d[layer][:n], weights[layer])
         by_encoded = torch.empty_like(kept.encoded)
         torch.mm(d[0], weights[0], out=by_encoded[:, _OWN:])
-        if table_gradient is not None:
+        if to.table is not None:
             size = block(_POINTS, n)
             grid = (triton.cdiv(n, size), self.layout.levels)
-            arrays = (state.places, state.level_weights, p, by_encoded, v, table_gradient)
+            arrays = (state.places, state.level_weights, p, by_encoded, v, to.table)
             launch(scatter, grid, *arrays, n, first, WIDTH=self._width, BLOCK=size)
-            if marks is not None and len(marks):  # a table on a GPU has none
-                marks.fill_(1)
+            if to.marks is not None and len(to.marks):  # a table on a GPU has none
+                to.marks.fill_(1)
         dp = torch.empty_like(p) if points else None
         if dp is not None:
             self._to_points(state, p, by_encoded, g, first, dp)
-        if not parameters:
+        if not to.parameters:
             return Pulled(dp, None)
         of_layers = [x for pair in zip(by_weight, by_bias, strict=True) for x in pair]
         return Pulled(dp, (*of_layers, by_last[None], sums[-1:]))

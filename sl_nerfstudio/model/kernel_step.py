@@ -11,7 +11,7 @@ from sl_nerfstudio.field.triton_backend import step_table
 from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.poses import PoseParameters
 from sl_nerfstudio.rendering.triton_poses import Moves, moved_poses
-from sl_nerfstudio.rendering.triton_step import Current, Devices, Pixels, Step, step_losses
+from sl_nerfstudio.rendering.triton_step import Pixels, Step, step_losses
 
 
 def kernel_step(
@@ -21,13 +21,11 @@ def kernel_step(
     none = index.new_empty(0, dtype=torch.int32)
     among = none if index.device.type == "cpu" else samples.training
     pixels = Pixels(index, among, samples.frame, samples.row, samples.column, samples.coords, samples.pattern)
+    devices = (model.cameras, model.projector, model.pattern)
     scalars = (model.kappa_now, model.surface_width_now, model.noise_px, model.px_per_length)
-    devices = Devices(model.cameras, model.projector, model.pattern)
     c = model.config
-    step = Step(pixels, devices, Current(*scalars), model.cache.values, c.sampling, c.losses, renders)
-    found = step_losses(model.field, step, *device_poses(model.device_poses))
-    metrics = {"coordinate_px": found.coordinate_px, "pattern_cosine": found.pattern_cosine}
-    return found.terms, {name: value for name, value in metrics.items() if value is not None}
+    step = Step(pixels, *devices, *scalars, model.cache.values, c.sampling, c.losses, renders)
+    return step_losses(model.field, step, *device_poses(model.device_poses))
 
 
 def compile_kernels(model: SLModel, sampler: SLPixelSampler) -> None:

@@ -304,7 +304,12 @@ class SLTrainer(Trainer):
             super().setup(test_mode)
             if torch.device(self.device).type == "cuda":
                 torch.backends.cuda.matmul.allow_tf32 = self.config.tf32
-                self._record_cuda_graph()
+                why = self._why_not_recorded()
+                if why:
+                    print(paragraph("graph", _not_recorded(why)), flush=True)
+                else:
+                    generator = self.pipeline.datamanager.train_pixel_sampler.generator
+                    self.record_steps(CudaRecorder([generator] if generator.device.type == "cuda" else []))
         for line in getattr(self.viewer_state, "viewer_info", []):
             print(paragraph("viewer", line), flush=True)
 
@@ -322,7 +327,7 @@ class SLTrainer(Trainer):
                 super().train()
             INTERRUPTION.remove()  # if interrupted they stay: a second signal ends the process at once
         finally:
-            self._leave_folder()
+            self.config.leave_folder()
 
     @property
     def _model(self) -> "SLModel":
@@ -412,10 +417,8 @@ class SLTrainer(Trainer):
         return loss.detach(), {name: term.detach() for name, term in terms.items()}, metrics
 
     def _why_not_recorded(self) -> str:
-        """Why steps cannot be recorded as a CUDA graph; "" if they can."""
+        """Why a GPU's steps cannot be recorded as a CUDA graph; "" if they can."""
         c = self.config
-        if torch.device(self.device).type != "cuda":
-            return f"the run is on {self.device}"
         reasons = {
             "--cuda-graph False": not c.cuda_graph,
             "--mixed-precision True": self.use_grad_scaler,
@@ -521,19 +524,6 @@ class SLTrainer(Trainer):
             if comms.is_main_process():
                 print(f"error: {error}", file=sys.stderr, flush=True)
             raise SystemExit(1) from None
-
-    def _record_cuda_graph(self) -> None:
-        why = self._why_not_recorded()
-        if why:
-            print(paragraph("graph", _not_recorded(why)), flush=True)
-        else:
-            generator = self.pipeline.datamanager.train_pixel_sampler.generator
-            self.record_steps(CudaRecorder([generator] if generator.device.type == "cuda" else []))
-
-    def _leave_folder(self) -> None:
-        leave = getattr(self.config, "leave_folder", None)
-        if leave is not None:
-            leave()
 
 
 def _not_recorded(why: str) -> str:

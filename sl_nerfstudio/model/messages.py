@@ -10,14 +10,7 @@ from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.calibration.stated import describe_change
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.geometry.devices import Device, IntrinsicsChange
-from sl_nerfstudio.model.pose_refinement import (
-    PriorConfig,
-    ScanAdjustment,
-    adjusted,
-    maps_and_held_out,
-    pose_prior,
-    scene_rig,
-)
+from sl_nerfstudio.model.pose_refinement import PriorConfig, ScanAdjustment, adjusted, maps_and_held_out
 from sl_nerfstudio.review.verdict import DepartedFrame, describe_departed, other_places
 
 # Intrinsics that agree better with the captures: found before training, kept only if held-out pixels confirm them.
@@ -55,9 +48,7 @@ def refine_intrinsics(
 
     def adjusted_with(change: IntrinsicsChange) -> ScanAdjustment:
         scan = loaded.scan.with_intrinsics_change(change)
-        start = scene_rig(scan, loaded.S_scene_world)
-        known = pose_prior(scan, loaded.S_scene_world, prior)
-        return adjusted(scan, loaded.S_scene_world, start, maps, refine, known, once)
+        return adjusted(scan, loaded.S_scene_world, maps, refine, prior, once)
 
     before = adjusted_with(stated)
     if before.intrinsics is None or not before.intrinsics.contradicts():

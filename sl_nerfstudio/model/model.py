@@ -1,7 +1,7 @@
 """The nerfstudio model: a signed distance field, and the poses of the devices that saw it."""
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import torch
@@ -18,7 +18,7 @@ from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.parameters import RefinePoses, SelfCalibration, constrained
 from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.field.field import CachedGrid, FieldConfig, SDFField
-from sl_nerfstudio.geometry.devices import DeviceKind, Intrinsics
+from sl_nerfstudio.geometry.devices import Intrinsics
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, rotate
 from sl_nerfstudio.model.messages import (
     contradiction_message,
@@ -31,10 +31,10 @@ from sl_nerfstudio.model.outputs import (
     History,
     MeasuredCoordinates,
     fit_metrics,
-    image_metrics_and_images,
     measure_decoding,
     picture_outputs,
     ray_outputs,
+    seen_by_rays,
 )
 from sl_nerfstudio.model.pose_refinement import PriorConfig, adjust_scan, scene_rig, sigmas_in_scan_units
 from sl_nerfstudio.model.poses import FrameTransforms, PoseParameters, ProjectorMoves
@@ -56,7 +56,6 @@ from sl_nerfstudio.rendering.losses import (
     surface_width_at,
 )
 from sl_nerfstudio.rendering.renderer import Renderer, SamplingConfig
-from sl_nerfstudio.rendering.volume_rendering import Rendered
 from sl_nerfstudio.review.verdict import departed_frames
 from sl_nerfstudio.scan import Scan
 
@@ -170,14 +169,10 @@ class SLModel(Model):
         rig = scene_rig(self.scan, self.S_scene_world)
         self.device_poses = pose_parameters(self.config, rig.T_world_camera, rig.T_world_projector)
         self.measured = MeasuredCoordinates(self.scan)
-        projector = Intrinsics.of(self.scan.projector)
-        self._projector_kind: DeviceKind = projector.model
-        self._projector_distorted = projector.distorted
-        cameras = Intrinsics.of([frame.camera for frame in self.scan.frames])
-        self._camera_kind: DeviceKind = cameras.model
-        self._cameras_distorted = cameras.distorted
-        self.register_buffer("camera_params", cameras.params, persistent=False)
-        self.register_buffer("projector_params", projector.params, persistent=False)
+        self._projector = Intrinsics.of(self.scan.projector)
+        self._cameras = Intrinsics.of([frame.camera for frame in self.scan.frames])
+        self.register_buffer("camera_params", self._cameras.params, persistent=False)
+        self.register_buffer("projector_params", self._projector.params, persistent=False)
         self.register_buffer("pattern", torch.from_numpy(self.scan.read_pattern()).float(), persistent=False)
         # a checkpoint must hold more than weights: the step, for annealing; the decoding noise, measured once; and the
         # change of the intrinsics, so that a resumed run has the same devices
@@ -247,12 +242,12 @@ class SLModel(Model):
     @property
     def projector(self) -> Intrinsics:
         """The projector's intrinsics, batch ()."""
-        return Intrinsics(self.projector_params, self._projector_kind, self._projector_distorted)
+        return replace(self._projector, params=self.projector_params)
 
     @property
     def cameras(self) -> Intrinsics:
         """The cameras' intrinsics, batch (frames)."""
-        return Intrinsics(self.camera_params, self._camera_kind, self._cameras_distorted)
+        return replace(self._cameras, params=self.camera_params)
 
     # ---- training
 
@@ -268,19 +263,11 @@ class SLModel(Model):
     def get_training_callbacks(
         self, training_callback_attributes: TrainingCallbackAttributes
     ) -> list[TrainingCallback]:
-        """Annealing before every step; the trainer itself calls `start` before the first one."""
+        """Annealing before every step; the trainer itself adjusts the poses before the first one."""
         return [TrainingCallback([TrainingCallbackLocation.BEFORE_TRAIN_ITERATION], self.anneal)]
 
-    def start(self, samples: Any) -> None:
-        """Before the first step: refine the poses, and measure the noise of the decoding."""
-        self.adjust_poses(samples)
-        self.measure_noise(samples)
-
     def adjust_poses(self, samples: Any) -> str:
-        """The first half of `start`, which takes longest: all poses together, if the settings say so.
-
-        Returns what was found, in words.
-        """
+        """Before the first step: all poses together, if the settings say so. Returns what was found, in words."""
         said: list[str] = []
         c, rig = self.config, scene_rig(self.scan, self.S_scene_world)
         if c.adjusts_poses and len(self.scan.frames) > 1:
@@ -300,7 +287,7 @@ class SLModel(Model):
         return "\n".join(filter(None, said))
 
     def measure_noise(self, samples: Any) -> None:
-        """The other half of `start`: how well the coordinates agree at the adjusted poses."""
+        """Before the first step: how well the coordinates agree at the adjusted poses."""
         camera, projector = self.poses_scene()
         noise = measure_decoding(self.scan, samples, camera.cpu(), projector.cpu())
         self.noise_px.fill_(noise.px)
@@ -320,7 +307,7 @@ class SLModel(Model):
         c = self.config
         self.step_now.fill_(step)
         self._set_scalars(step)
-        self.field.set_level_weights(level_weights_at(c.annealing, c.sdf.levels, step, c.schedule_iterations))
+        self.field.encoding.set_level_weights(level_weights_at(c.annealing, c.sdf.levels, step, c.schedule_iterations))
 
     def _set_scalars(self, step: int) -> None:
         """What steps read on their device, and what the host knows of it."""
@@ -417,22 +404,15 @@ class SLModel(Model):
         self, outputs: dict[str, Any], batch: dict[str, Tensor], metrics_dict: dict[str, Tensor] | None = None
     ) -> dict[str, Tensor]:
         """The weighted losses of a training step; in evaluation, the terms that need only rendered outputs."""
-        w = self.config.losses
         losses: dict[str, Tensor] = {}
-        if "origins" not in outputs:
-            coordinates = torch.cat([outputs["coordinate_x"], outputs["coordinate_y"]], -1)
-            counts = batch["decoded"][:, 0] & (outputs["accumulation"][:, 0] > 0.5)
-            losses["coordinates"] = self._per_pixel * coordinate_loss(coordinates, batch["coords"], counts)
-            losses["pattern"] = w.pattern * pattern_loss(outputs["pattern"][:, 0], batch["pattern"][:, 0])
-            return losses
-        if "rendered" in outputs:
-            rendered: Rendered = outputs["rendered"]
-            n = len(rendered.depth)
-            counts = batch["decoded"][:n, 0] & (rendered.lit > 0.5)
-            error = coordinate_loss(rendered.coordinates, batch["coords"][:n], counts)
+        seen = seen_by_rays(outputs)
+        if seen is not None:
+            coordinates, pattern, lit = seen
+            n = len(pattern)
+            error = coordinate_loss(coordinates, batch["coords"][:n], batch["decoded"][:n, 0] & lit)
             losses["coordinates"] = self._per_pixel * error
-            losses["pattern"] = w.pattern * pattern_loss(rendered.pattern, batch["pattern"][:n, 0])
-        return losses | self._field_losses(outputs, batch)
+            losses["pattern"] = self.config.losses.pattern * pattern_loss(pattern, batch["pattern"][:n, 0])
+        return losses | self._field_losses(outputs, batch) if "origins" in outputs else losses
 
     def _field_losses(self, outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """The terms that need no rendering."""
@@ -474,8 +454,16 @@ class SLModel(Model):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Any]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Rendered and captured images side by side, for one whole frame."""
-        return image_metrics_and_images(outputs, batch)
+        """Captured and rendered image side by side, [H, 2 W, 3], and the images of the other outputs."""
+        h, w = outputs["rgb"].shape[:2]
+        captured = batch["image"].to(outputs["rgb"].device)[:h, :w, :3]
+        images = {
+            "img": torch.cat([captured, outputs["rgb"]], 1),
+            "coordinates": outputs["coordinates"],
+            "normals": outputs["normals"],
+            "pattern": outputs["pattern"].expand(-1, -1, 3),
+        }
+        return {"accumulation_mean": float(outputs["accumulation"].mean())}, images
 
 
 def pose_parameters(

@@ -14,10 +14,11 @@ from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.dataparser.dataparser import PixelSamples
 from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, transform
-from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, evenly_spaced
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
 from sl_nerfstudio.geometry.triangulation import epipolar_residual, triangulate
 from sl_nerfstudio.rendering.direct_losses import DecodingNoise
 from sl_nerfstudio.rendering.renderer import Ends, Renderer
+from sl_nerfstudio.rendering.volume_rendering import Rendered
 from sl_nerfstudio.scan import Scan
 
 
@@ -122,20 +123,10 @@ def measure_decoding(
     residuals, slopes = [], []
     projector = Intrinsics.of(scan.projector, torch.float64)
     for number, frame in enumerate(scan.frames):
-        first, last = int(samples.first[number]), int(samples.first[number + 1])
-        if last == first:
-            continue
-        pixels = samples.at(first + torch.from_numpy(evenly_spaced(last - first, min(_PER_FRAME, last - first))))
+        pixels = samples.some_of(number, _PER_FRAME)
         ok = pixels.decoded
-        camera = Intrinsics.of(frame.camera, torch.float64)
-        arguments = (
-            camera,
-            T_scene_camera[number],
-            pixels.uv[ok].double(),
-            projector,
-            T_scene_projector[number],
-            pixels.coords[ok].double(),
-        )
+        seen = Intrinsics.of(frame.camera, torch.float64), T_scene_camera[number], pixels.uv[ok].double()
+        arguments = (*seen, projector, T_scene_projector[number], pixels.coords[ok].double())
         residuals.append(epipolar_residual(*arguments).abs())
         slopes.append(1 / triangulate(*arguments).sigma_depth)
     residual, slope = torch.cat(residuals), torch.cat(slopes)
@@ -240,13 +231,11 @@ def ray_outputs(
         return _rendered(renderer, origins, directions, T_scene_projector, view, ends)
     some_ends = None if ends is None else (ends[0][near], ends[1][near])
     some = _rendered(renderer, origins[near], directions[near], T_scene_projector, view[near], some_ends)
-    return {name: _spread(values, near, _NOTHING.get(name, 0.0)) for name, values in some.items()}
-
-
-def _spread(values: Float[Tensor, "some c"], where: Bool[Tensor, "rays"], elsewhere: float) -> Float[Tensor, "rays c"]:
-    result = values.new_full((len(where), values.shape[1]), elsewhere)
-    result[where] = values
-    return result
+    outputs = {}
+    for name, values in some.items():
+        outputs[name] = values.new_full((len(near), values.shape[1]), _NOTHING.get(name, 0.0))
+        outputs[name][near] = values
+    return outputs
 
 
 def _rendered(
@@ -302,16 +291,26 @@ def coordinate_colours(uv: Float[Tensor, "n 2"], valid: Tensor) -> Float[Tensor,
     return torch.where(valid[:, None], colour, 0.0)
 
 
+def seen_by_rays(
+    outputs: dict[str, Any],
+) -> tuple[Float[Tensor, "rays 2"], Float[Tensor, "rays"], Bool[Tensor, "rays"]] | None:
+    """Rendered coordinates and pattern, and which rays meet something lit; None in steps that render nothing."""
+    if "rendered" in outputs:
+        rendered: Rendered = outputs["rendered"]
+        return rendered.coordinates, rendered.pattern, rendered.lit > 0.5
+    if "coordinate_x" not in outputs:
+        return None
+    coordinates = torch.cat([outputs["coordinate_x"], outputs["coordinate_y"]], -1)
+    return coordinates, outputs["pattern"][:, 0], outputs["accumulation"][:, 0] > _OPAQUE
+
+
 @torch.no_grad()
 def fit_metrics(outputs: dict[str, Any], batch: dict[str, Tensor]) -> dict[str, Tensor]:
     """Median coordinate residual (pattern pixels) and cosine of rendered and captured pattern."""
-    if "rendered" in outputs:
-        coordinates, pattern = outputs["rendered"].coordinates, outputs["rendered"].pattern
-    elif "coordinate_x" in outputs:
-        coordinates = torch.cat([outputs["coordinate_x"], outputs["coordinate_y"]], -1)
-        pattern = outputs["pattern"][:, 0]
-    else:
+    seen = seen_by_rays(outputs)
+    if seen is None:
         return {}
+    coordinates, pattern, _ = seen
     n = len(pattern)
     error = (coordinates - batch["coords"][:n]).norm(dim=-1)
     return {
@@ -326,20 +325,3 @@ def _median(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tens
     number = counts.sum()
     middle = last.gather(0, ((number - 1) // 2).clamp_min(0)[None])[0]
     return torch.where(number > 0, middle, torch.nan)
-
-
-@torch.no_grad()
-def image_metrics_and_images(
-    outputs: dict[str, Tensor], batch: dict[str, Any]
-) -> tuple[dict[str, float], dict[str, Tensor]]:
-    """Captured and rendered image side by side, [H, 2 W, 3], and the images of the other outputs."""
-    captured = batch["image"].to(outputs["rgb"].device)[..., :3]
-    h, w = outputs["rgb"].shape[:2]
-    captured = captured[:h, :w]
-    images = {
-        "img": torch.cat([captured, outputs["rgb"]], 1),
-        "coordinates": outputs["coordinates"],
-        "normals": outputs["normals"],
-        "pattern": outputs["pattern"].expand(-1, -1, 3),
-    }
-    return {"accumulation_mean": float(outputs["accumulation"].mean())}, images

@@ -14,7 +14,6 @@ import torch
 import tyro
 import xatlas
 from jaxtyping import Float, Int
-from nerfstudio.cameras.rays import RayBundle
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackAttributes, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from nerfstudio.utils import comms
@@ -44,9 +43,8 @@ from sl_nerfstudio.parallel import compiled_range, torch_on_one_thread
 # `ns-export` without a GPU: what takes hours there in nerfstudio, in a second.
 #
 # For its default `--texture-method nerf`, nerfstudio compares every pixel of the texture with every triangle of the
-# mesh:
-# with its defaults (2048 x 2048 pixels, 50,000 triangles) hours without a GPU. Here each triangle is drawn into the
-# texture. nerfstudio offers no way to choose another function, so it is replaced, when `ns-export` opens a run.
+# mesh: with its defaults (2048 x 2048 pixels, 50,000 triangles) hours without a GPU. Here each triangle is drawn into
+# the texture. nerfstudio offers no way to choose another function, so it is replaced, when `ns-export` opens a run.
 
 _OUTSIDE = 10.0  # scene units: rays of pixels without a triangle start here and lead away from the scene
 
@@ -163,16 +161,13 @@ class SLPipeline(VanillaPipeline):
     ) -> list[TrainingCallback]:
         """The model's callbacks, with those of this pipeline before and after them."""
         before, after = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION
+        trainer = cast(SLTrainer, training_callback_attributes.trainer)
         return [
-            TrainingCallback([before], cast(SLTrainer, training_callback_attributes.trainer).begin_step),
+            TrainingCallback([before], trainer.begin_step),
             TrainingCallback([before], self._seed_step),
             *super().get_training_callbacks(training_callback_attributes),
             TrainingCallback([after], self._update_viewer),
-            TrainingCallback(
-                [TrainingCallbackLocation.AFTER_TRAIN],
-                self._say_what_next,
-                kwargs={"trainer": training_callback_attributes.trainer},
-            ),
+            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._say_what_next, kwargs={"trainer": trainer}),
         ]
 
     def get_train_loss_dict(self, step: int) -> tuple[Any, dict[str, Tensor], dict[str, Tensor]]:
@@ -224,12 +219,10 @@ class SLPipeline(VanillaPipeline):
         rays, batch = self.datamanager.held_out_batch(frame, _HELD_OUT_PIXELS)
         if len(rays) == 0:
             return {}
-        outputs = self._outputs(rays)
+        size = self.model.config.eval_num_rays_per_chunk
+        chunks = [self.model(rays[first : first + size]) for first in range(0, len(rays), size)]
+        outputs = {name: torch.cat([chunk[name] for chunk in chunks]) for name in chunks[0]}
         return {name: float(value) for name, value in self.model.get_metrics_dict(outputs, batch).items()}
-
-    def _outputs(self, rays: RayBundle) -> dict[str, Tensor]:
-        chunks = [self.model(chunk) for chunk in _chunks(rays, self.model.config.eval_num_rays_per_chunk)]
-        return {name: torch.cat([chunk[name] for chunk in chunks]) for name in chunks[0]}
 
     def _save_images(self, folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
@@ -319,8 +312,3 @@ def mean_over_frames(per_frame: list[dict[str, float]], with_std: bool) -> dict[
         if with_std:
             result[f"{name}_std"] = math.sqrt(sum((v - mean) ** 2 for v in values) / max(len(values) - 1, 1))
     return result
-
-
-def _chunks(rays: RayBundle, size: int) -> Iterator[RayBundle]:
-    for first in range(0, len(rays), size):
-        yield rays[first : first + size]

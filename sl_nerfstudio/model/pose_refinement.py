@@ -43,7 +43,6 @@ from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.dataparser.dataparser import BLOCK, PixelBatch, PixelSamples
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, inverse, log_se3
-from sl_nerfstudio.geometry.numerics import evenly_spaced
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan import Scan, measured_length
 
@@ -116,11 +115,11 @@ def adjust_scan(
     """Adjust all poses together, fix the gauge, and keep the result only if held-out pixels agree better with it."""
     start = scene_rig(scan, S_scene_world)
     maps, held_out = maps_and_held_out(scan, samples)
-    stated = pose_prior(scan, S_scene_world, prior)
-    found = adjusted(scan, S_scene_world, start, maps, refine, stated, settings)
+    found = adjusted(scan, S_scene_world, maps, refine, prior, settings)
     decision = cross_validate(start, found.rig, held_out, maps, found.noise_px)
     if decision.better:
         return replace(found, cross_validation=decision)
+    stated = pose_prior(scan, S_scene_world, prior)
     nothing_learnt = decision.worse or refine == "off"
     sigma, factor = (stated.sigma, joint_of_prior(stated, start)) if nothing_learnt else _known_by_both(start, found)
     return replace(found, rig=start, sigma=sigma, factor=factor, cross_validation=decision, modes=())
@@ -141,13 +140,13 @@ def _known_by_both(start: Rig, found: ScanAdjustment) -> tuple[Float[Tensor, "fr
 def adjusted(
     scan: Scan,
     S_scene_world: Similarity,
-    start: Rig,
     maps: CoordinateMaps,
     refine: RefinePoses,
-    prior: PosePrior,
+    config: PriorConfig,
     settings: AdjustmentSettings,
 ) -> ScanAdjustment:
-    """Adjust the scan's poses from `start`, and restore the scan's lengths; not cross-validated."""
+    """Adjust the scan's poses, and restore the scan's lengths; not cross-validated."""
+    start, prior = scene_rig(scan, S_scene_world), pose_prior(scan, S_scene_world, config)
     begin = constrained(refine, start)
     found: Adjustment = adjust(begin, maps, prior, refine, settings)
     # a frame whose starting pose proved to be wrong must not turn or stretch the scene
@@ -231,9 +230,7 @@ def maps_and_held_out(scan: Scan, samples: PixelSamples) -> tuple[CoordinateMaps
     """Coordinate images without the held-out pixels, and a selection of the held-out pixels."""
     frames, uv_camera, uv_projector, blocks = [], [], [], []
     for number, frame in enumerate(scan.frames):
-        index = samples.held_out_of(number)
-        count = min(len(index), HELD_OUT_PER_FRAME)
-        test = samples.at(index[torch.from_numpy(evenly_spaced(len(index), count))])
+        test = samples.held_out_of(number, HELD_OUT_PER_FRAME)
         decoded = test.decoded
         frames.append(test.frame[decoded])
         uv_camera.append(test.uv[decoded].double())

@@ -10,14 +10,13 @@ import io
 import math
 import socket
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import redirect_stdout, suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import viser
-from jaxtyping import Float64, UInt8
+from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError, first_line
@@ -53,16 +52,6 @@ _TRAINING_PER_DRAWING = 20  # seconds of training for each second that the surfa
 _FIRST_SECONDS = 0.2  # counted for the frames, which are drawn once
 
 
-@dataclass(frozen=True)
-class ShownFrame:
-    """A frame, and points that it decoded."""
-
-    name: str
-    camera: Device
-    projector: Device
-    points: Float64[ndarray, "n 3"]  # in world axes
-
-
 class Preview:
     """A page that shows what has been found; it ends with the block that it is opened for."""
 
@@ -70,8 +59,8 @@ class Preview:
         """Serve the page at the first free port; `shared`: to the whole network. Raises UserError if there is none."""
         port = _free_port()
         with redirect_stdout(io.StringIO()):  # viser prints its address, in a frame
-            self._server = viser.ViserServer(EVERYWHERE if shared else HOST, port, verbose=False)
-        found = self._server.get_port()
+            self.server = viser.ViserServer(EVERYWHERE if shared else HOST, port, verbose=False)
+        found = self.server.get_port()
         address = (
             f"{_own_address() if shared else HOST}:{found} (open it in a browser; the page ends with this command)"
         )
@@ -81,28 +70,23 @@ class Preview:
         self._drawn: dict[str, viser.SceneNodeHandle] = {}
         self._training = False
         self._due = -math.inf
-        gui = self._server.gui
+        gui = self.server.gui
         self._title = title
         self._said = gui.add_markdown("")
         self._shown = {name: gui.add_checkbox(name, True) for name in ("points", "cameras", "projectors", "surface")}
         self._groups: dict[str, viser.SceneNodeHandle] = {
-            name: self._server.scene.add_frame(f"/{name}", show_axes=False) for name in self._shown if name != "surface"
+            name: self.server.scene.add_frame(f"/{name}", show_axes=False) for name in self._shown if name != "surface"
         }
         for name, box in self._shown.items():
             box.on_update(lambda _, name=name: self._show(name))
-        self._server.on_client_connect(self._look)
-
-    @property
-    def server(self) -> viser.ViserServer:
-        """What serves the page, for those who show more on it."""
-        return self._server
+        self.server.on_client_connect(self._look)
 
     def __enter__(self) -> "Preview":
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._server.stop()
-        loop = self._server._websock_server._broadcast_buffer.event_loop
+        self.server.stop()
+        loop = self.server._websock_server._broadcast_buffer.event_loop
         with suppress(RuntimeError):
             loop.call_soon_threadsafe(lambda: None)  # wake it, or it closes the port with the next message only
 
@@ -118,19 +102,21 @@ class Preview:
     def registered(self, clouds: Sequence[FrameCloud], poses: DevicePoses, what: str) -> None:
         """Draw the frames whose poses are known (not NaN), and say what was done."""
         index = np.flatnonzero(np.isfinite(poses.T_world_camera).all((1, 2)))
-        chosen, placed = [clouds[k] for k in index], poses[index]
-        frames = list(_shown(((c.name, c.camera, c.projector, c.coords) for c in chosen), placed))
-        self._draw(frames, placed, _scene_of(frames, placed))
+        chosen = [clouds[k] for k in index]
+        self._draw([(c.name, c.camera, c.projector) for c in chosen], (c.coords for c in chosen), poses[index])
         self.say(f"{len(index)} of {len(clouds)} frames {what}")
 
     def trained(self, model: "TrainedModel") -> None:
         """Draw the surface after a step of the training, if a browser is connected and enough time has passed."""
         begun = time.monotonic()
-        if begun < self._due or not self._server.get_clients():
+        if begun < self._due or not self.server.get_clients():
             return
         if not self._training:  # there is no surface yet, but a sphere
             self._training = True
-            self._draw_scan(model)
+            scan = model.scan
+            frames = [(frame.name, frame.camera, scan.projector) for frame in scan.frames]
+            coords = (frame.read_coords() for frame in scan.frames)
+            self._draw(frames, coords, model.poses(), model.S_scene_world)
             self.say(f"training, step {model.step}")
             self._due = time.monotonic() + _TRAINING_PER_DRAWING * _FIRST_SECONDS
             return
@@ -139,39 +125,47 @@ class Preview:
 
     # ---- the scene
 
-    def _draw_scan(self, model: "TrainedModel") -> None:
-        """The frames of the scan at their refined poses, in the scene of the training."""
-        scan, poses = model.scan, model.poses()
-        decoded = ((f.name, f.camera, scan.projector, f.read_coords()) for f in scan.frames)
-        self._draw(list(_shown(decoded, poses)), poses, model.S_scene_world)
+    def _draw(
+        self,
+        frames: Sequence[tuple[str, Device, Device]],
+        coords: Iterable[Float32[ndarray, "h w 2"]],
+        poses: DevicePoses,
+        S_scene_world: Similarity | None = None,
+    ) -> None:
+        """Draw devices and points in place of those that are there, and look at them if they are the first.
 
-    def _draw(self, frames: Sequence[ShownFrame], poses: DevicePoses, S_scene_world: Similarity) -> None:
-        """Draw devices and points in place of those that are there, and look at them if they are the first."""
-        scene, first = self._server.scene, self._devices is None
+        `frames` are names, cameras and projectors. Without `S_scene_world`, the scene is like that of the training:
+        upright, about the points.
+        """
+        scene, first = self.server.scene, self._devices is None
+        most = min(_MOST_OF_A_FRAME, MOST_POINTS // max(len(poses), 1))
+        seen = zip(frames, coords, poses.T_world_camera, poses.T_world_projector, strict=True)
+        points = [
+            decoded_points(camera, projector, uv, T_camera, T_projector, most)
+            for (_, camera, projector), uv, T_camera, T_projector in seen
+        ]
+        if S_scene_world is None:
+            turned = Similarity(1.0, upright(poses.T_world_camera), np.zeros(3))
+            S_scene_world = centred_on(turned.points(np.concatenate(points)), _OUTSIDE) @ turned
         placed = poses.mapped(S_scene_world)
         self._devices, size = placed.stacked(), pyramid_size(placed.T_world_camera)
         before, self._drawn = self._drawn, {}
-        with self._server.atomic():
-            for frame, T_camera, T_projector, colour in zip(
-                frames, placed.T_world_camera, placed.T_world_projector, _colours(len(frames)), strict=True
-            ):
-                devices = ("camera", frame.camera, T_camera), ("projector", frame.projector, T_projector)
-                for kind, device, T in devices:
-                    name = f"/{kind}s/{frame.name}"
-                    node = scene.add_camera_frustum(
-                        name, vertical_fov(device), device.w / device.h, size, color=COLOURS[kind]
-                    )
+        with self.server.atomic():
+            colours = _colours(len(frames))
+            rows = zip(frames, placed.T_world_camera, placed.T_world_projector, points, colours, strict=True)
+            for (name, camera, projector), T_camera, T_projector, p, colour in rows:
+                for kind, device, T in (("camera", camera, T_camera), ("projector", projector, T_projector)):
+                    path, shape = f"/{kind}s/{name}", (vertical_fov(device), device.w / device.h)
+                    self._drawn[path] = node = scene.add_camera_frustum(path, *shape, size, color=COLOURS[kind])
                     place(node, T)
-                    self._drawn[name] = node
-                p, name = S_scene_world.points(frame.points), f"/points/{frame.name}"
+                p, path = S_scene_world.points(p), f"/points/{name}"
                 p = p[np.linalg.norm(p, axis=1) < _FARTHEST] * SCENE_SCALE
-                self._drawn[name] = scene.add_point_cloud(
-                    name, p, np.tile(colour, (len(p), 1)), _POINT_SIZE * SCENE_SCALE, "circle"
-                )
+                rgb = np.tile(colour, (len(p), 1))
+                self._drawn[path] = scene.add_point_cloud(path, p, rgb, _POINT_SIZE * SCENE_SCALE, "circle")
             for name in before.keys() - self._drawn.keys():
                 before[name].remove()
         if first or self._training:
-            for client in self._server.get_clients().values():
+            for client in self.server.get_clients().values():
                 self._look(client)
 
     def _draw_surface(self, model: "TrainedModel") -> None:
@@ -182,7 +176,7 @@ class Preview:
         except UserError as error:
             return self.say(f"training, step {model.step}: {first_line(error)}")
         first, self._surface = self._surface is None, mesh.vertices
-        self._groups["surface"] = self._server.scene.add_mesh_simple(
+        self._groups["surface"] = self.server.scene.add_mesh_simple(
             "/surface", SCENE_SCALE * mesh.vertices, mesh.faces, color=CLAY, visible=self._shown["surface"].value
         )
         if first:
@@ -220,22 +214,6 @@ def _own_address() -> str:
             return str(tried.getsockname()[0])
         except OSError:
             return HOST
-
-
-def _shown(frames: Iterable[tuple[str, Device, Device, ndarray]], poses: DevicePoses) -> Iterator[ShownFrame]:
-    """Frames by their names, devices and coordinates."""
-    most = min(_MOST_OF_A_FRAME, MOST_POINTS // max(len(poses), 1))
-    placed = zip(frames, poses.T_world_camera, poses.T_world_projector, strict=True)
-    for (name, camera, projector, coords), T_camera, T_projector in placed:
-        points = decoded_points(camera, projector, coords, T_camera, T_projector, most)
-        yield ShownFrame(name, camera, projector, points)
-
-
-def _scene_of(frames: Sequence[ShownFrame], poses: DevicePoses) -> Similarity:
-    """From the world of the registration to a scene like that of the training: upright, about the points."""
-    R = upright(poses.T_world_camera)
-    turned = Similarity(1.0, R, np.zeros(3))
-    return centred_on(turned.points(np.concatenate([frame.points for frame in frames])), _OUTSIDE) @ turned
 
 
 def _colours(count: int) -> list[UInt8[ndarray, "3"]]:

@@ -249,37 +249,33 @@ LOCK, PARTIAL = ".lock", ".checkpoint.partial"
 CONFIG = "config.yml"
 
 
-class RunFolder:
-    """A folder that this process has for itself until `leave`, or until it ends, however it ends."""
+def take_folder(path: Path) -> int:
+    """Make the folder, and have it for this process until it closes the file returned, or ends, however it ends.
 
-    def __init__(self, path: Path) -> None:
-        """Make and take the folder. Raises UserError if another process has it, or if it cannot be written."""
-        self.path = path
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            self._lock, locked = open_alone(path / LOCK)
-            os.ftruncate(self._lock, 0)
-            write_all(self._lock, str(os.getpid()).encode())
-        except BlockingIOError as error:
-            raise UserError(
-                f"{path}: another ns-train is writing there (process {_number_in(path / LOCK)})\n"
-                "    cause:  two trainings were started with the same --output-dir, --experiment-name and --timestamp\n"
-                "    remedy: wait until it has ended, or choose another --timestamp"
-            ) from error
-        except OSError as error:
-            raise UserError(
-                f"{path}: cannot be written ({error.strerror})\n"
-                "    cause:  missing permissions, a read-only disk, or a file where a folder is needed\n"
-                "    remedy: choose another place with --output-dir"
-            ) from error
-        if not locked:
-            print(f"note: {path} is on a disk that knows no locks; start no second run there", file=sys.stderr)
-        with suppress(OSError):
-            (path / PARTIAL).unlink()  # left by a process that was killed while it wrote
-
-    def leave(self) -> None:
-        """Let other processes have the folder."""
-        os.close(self._lock)
+    Raises UserError if another process has it, or if it cannot be written.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        lock, locked = open_alone(path / LOCK)
+        os.ftruncate(lock, 0)
+        write_all(lock, str(os.getpid()).encode())
+    except BlockingIOError as error:
+        raise UserError(
+            f"{path}: another ns-train is writing there (process {_number_in(path / LOCK)})\n"
+            "    cause:  two trainings were started with the same --output-dir, --experiment-name and --timestamp\n"
+            "    remedy: wait until it has ended, or choose another --timestamp"
+        ) from error
+    except OSError as error:
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror})\n"
+            "    cause:  missing permissions, a read-only disk, or a file where a folder is needed\n"
+            "    remedy: choose another place with --output-dir"
+        ) from error
+    if not locked:
+        print(f"note: {path} is on a disk that knows no locks; start no second run there", file=sys.stderr)
+    with suppress(OSError):
+        (path / PARTIAL).unlink()  # left by a process that was killed while it wrote
+    return lock
 
 
 def _number_in(lock: Path) -> str:

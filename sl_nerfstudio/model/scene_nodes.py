@@ -124,14 +124,14 @@ class DeviceNodes:
 
     def _drawn_path(self) -> viser.MeshHandle:
         ends = np.stack([self.start[:, :3, 3], self.current[:, :3, 3]], 1) * SCENE_SCALE
-        vertices, faces = rods(ends, _ROD * self._scale)
-        return add_rods(self._scene, f"/moved/{self._kind}", vertices, faces, COLOURS[self._kind])
+        return add_rods(self._scene, f"/moved/{self._kind}", ends, _ROD * self._scale, COLOURS[self._kind])
 
 
 def add_rods(
-    scene: viser.SceneApi, name: str, vertices: Float[ndarray, "v 3"], faces: ndarray, colour: Colour
+    scene: viser.SceneApi, name: str, segments: Float[ndarray, "n 2 3"], radius: float, colour: Colour
 ) -> viser.MeshHandle:
     """A mesh of rods; the viewer accepts no empty one, so it has an invisible triangle then."""
+    vertices, faces = rods(segments, radius)
     if not len(faces):
         vertices, faces = np.zeros((3, 3)), np.array([[0, 1, 2]])
     return scene.add_mesh_simple(name, vertices, faces, color=colour, side="double")

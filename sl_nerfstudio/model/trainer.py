@@ -1,5 +1,6 @@
 """What `ns-train` is asked for, and what is checked before it starts: faults are found before anything is written."""
 
+import os
 import shlex
 import sys
 from dataclasses import dataclass, field, replace
@@ -27,7 +28,6 @@ from sl_nerfstudio.model.run_files import (
     CONFIG,
     INTERRUPTION,
     Checkpoint,
-    RunFolder,
     checkpoints_in,
     find_checkpoint,
     go_on_command,
@@ -35,13 +35,14 @@ from sl_nerfstudio.model.run_files import (
     read_checkpoint,
     require_unused,
     settings_fingerprint,
+    take_folder,
 )
 from sl_nerfstudio.parallel import gpu_fault, gpu_found
 from sl_nerfstudio.scan import require_valid
 from sl_nerfstudio.storage import write_atomic
 
-_TAKEN: dict[Path, RunFolder] = {}
-"""The folders that this process writes to: not part of a configuration, which is written to config.yml."""
+_TAKEN: dict[Path, int] = {}
+"""The folders that this process writes to, with their locks: not part of a configuration, which is a file there."""
 
 
 @dataclass
@@ -106,7 +107,8 @@ class SLTrainerConfig(TrainerConfig):
         with phase("check") as check:
             require_valid(root)
             frames = len(load_scan(root).scan.frames)
-            check.say(f"{short_path(root)}: {frames} frames, no faults{_resumed(begun)}")
+            resumed = "" if begun is None else f"; goes on after step {begun.step} of {short_path(begun.path)}"
+            check.say(f"{short_path(root)}: {frames} frames, no faults{resumed}")
         pipeline: SLPipelineConfig = self.pipeline  # type: ignore[assignment]
         pipeline.scan_fingerprint = load_scan(root).fingerprint
         if begun is not None:
@@ -158,9 +160,9 @@ class SLTrainerConfig(TrainerConfig):
 
     def leave_folder(self) -> None:
         """Let other processes have the run's folder."""
-        folder = _TAKEN.pop(self.get_base_dir(), None)
-        if folder is not None:
-            folder.leave()
+        lock = _TAKEN.pop(self.get_base_dir(), None)
+        if lock is not None:
+            os.close(lock)
 
     def _continue(self) -> Checkpoint | None:
         """For the config.yml of an earlier run: go on where its last checkpoint is, up to the run's last step."""
@@ -209,13 +211,13 @@ class SLTrainerConfig(TrainerConfig):
                 require_unused(folder, models, method)
 
         require()
-        taken = RunFolder(folder)
+        lock = take_folder(folder)
         try:
             require()  # again: another process may have written meanwhile
         except UserError:
-            taken.leave()
+            os.close(lock)
             raise
-        _TAKEN[folder] = taken
+        _TAKEN[folder] = lock
         self.last_step = self.max_num_iterations + (-1 if begun is None else begun.step)
 
     def _scan_root(self) -> Path:
@@ -258,10 +260,6 @@ def _intrinsics_change(
         found = refine_intrinsics(loaded, stated, model.refine_poses, model.prior, model.adjustment)
         shown.say(refined_intrinsics_message(found, cameras, loaded.scan.projector))
     return found.change
-
-
-def _resumed(begun: Checkpoint | None) -> str:
-    return "" if begun is None else f"; goes on after step {begun.step} of {short_path(begun.path)}"
 
 
 def _with_length(scheduler: SchedulerConfig | None, steps: int) -> SchedulerConfig | None:

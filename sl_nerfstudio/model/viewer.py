@@ -39,7 +39,6 @@ from sl_nerfstudio.model.scene_nodes import (
     look_at_object,
     place,
     pyramid_size,
-    rods,
 )
 from sl_nerfstudio.scan import Scan
 
@@ -190,8 +189,8 @@ class Panel:
             self.names = gui.add_checkbox("All names", False, hint="Otherwise those of the chosen frame")
         self._frames, self._training = names, training
         for name in ("surface", "frame", "rays", "projectors", "starting", "names"):
-            getattr(self, name).on_update(_Call(changed, name))
-        self.update.on_click(_Call(changed, "update"))
+            getattr(self, name).on_update(lambda _, name=name: changed(name))
+        self.update.on_click(lambda _: changed("update"))
         self.show_frame()
 
     @property
@@ -217,16 +216,6 @@ class Panel:
         self._legend.content = text
 
 
-class _Call:
-    """A callback that passes on a name, not viser's event."""
-
-    def __init__(self, changed: Callable[[str], None], name: str) -> None:
-        self._changed, self._name = changed, name
-
-    def __call__(self, event: viser.GuiEvent) -> None:
-        self._changed(self._name)
-
-
 def legend(coloured: Coloured) -> str:
     """Markdown: the colour scale with its limits, and what it shows."""
     if coloured.scale is None:
@@ -242,8 +231,6 @@ def legend(coloured: Coloured) -> str:
 _PATTERN_PIXELS = 256  # longest side of the pattern drawn on a projector
 _SECONDS_BETWEEN_UPDATES = 0.5
 _RAY = 0.012  # radius of a ray, as a share of a pyramid's size
-
-ScenePoses = tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "n 4 4"]]
 
 
 class SceneView(ViewerControl):
@@ -309,10 +296,8 @@ class SceneView(ViewerControl):
 
     def show_devices(self) -> None:
         """Show and hide pyramids, lines and names as the panel says."""
-        if self._devices is None:
-            return
-        cameras, projectors = self._devices
-        panel = self.panel
+        assert self._devices is not None
+        (cameras, projectors), panel = self._devices, self.panel
         starting, projected = panel.starting.value, panel.projectors.value
         named = range(len(self._model.scan.frames)) if panel.names.value else [panel.chosen_frame]
         with self.viser_server.atomic():
@@ -328,9 +313,8 @@ class SceneView(ViewerControl):
         frame, (camera, projector) = self.panel.chosen_frame, self._model.poses_scene()
         segments = pattern_rays(self._model.scan, frame, camera[frame], projector[frame])
         for kind, ends in zip(COLOURS, segments, strict=True):
-            drawn = rods(ends * SCENE_SCALE, _RAY * self._scale)
-            name = f"/rays/{kind}"
-            self._nodes[name] = add_rods(self.viser_server.scene, name, *drawn, COLOURS[kind])
+            name, scene = f"/rays/{kind}", self.viser_server.scene
+            self._nodes[name] = add_rods(scene, name, ends * SCENE_SCALE, _RAY * self._scale, COLOURS[kind])
 
     def show_surface(self) -> None:
         """Draw the surface as a mesh in the chosen colours, or leave it to the rendered picture."""
@@ -401,7 +385,7 @@ class SceneView(ViewerControl):
     def _is_due(self) -> bool:
         return time.monotonic() - self._last_update > _SECONDS_BETWEEN_UPDATES and bool(self.viser_server.get_clients())
 
-    def _numpy_poses(self) -> ScenePoses:
+    def _numpy_poses(self) -> tuple[Float64[ndarray, "n 4 4"], Float64[ndarray, "n 4 4"]]:
         camera, projector = self._model.poses_scene()
         return camera.detach().cpu().double().numpy(), projector.detach().cpu().double().numpy()
 

@@ -28,7 +28,7 @@ from sl_nerfstudio.rendering.volume_rendering import sphere_interval
 
 # Where camera rays meet projector rays, in one compiled loop on the CPU, without gradients.
 #
-# `direct_losses.py` has the same as torch operations, each of which takes longer to begin than to do its work.
+# `_measured` has the same as torch operations, each of which takes longer to begin than to do its work.
 
 _PARALLEL = 1e-12  # sin^2 of the angle between rays, below which they count as parallel
 
@@ -111,9 +111,7 @@ class DecodingNoise:
     """How well coordinates are decoded, and how pattern pixels relate to lengths."""
 
     px: Float[Tensor, ""] | float  # 1 sigma of the epipolar residual, pattern pixels
-    px_per_length: (
-        Float[Tensor, ""] | float
-    )  # median slope of the coordinate along camera rays, pattern pixels per scene unit
+    px_per_length: Float[Tensor, ""] | float  # median slope along camera rays, pattern pixels per scene unit
 
 
 @dataclass(frozen=True)
@@ -127,9 +125,7 @@ class MeasuredRays:
 
     def chosen(self, index: Bool[Tensor, "n"]) -> "MeasuredRays":
         """Some of the rays."""
-        return MeasuredRays(
-            self.origins[index], self.directions[index], self.T_scene_projector[index], self.uv_projector[index]
-        )
+        return MeasuredRays(*(values[index] for values in vars(self).values()))
 
 
 def random_points(count: int, device: torch.device) -> Float[Tensor, "n 3"]:
@@ -160,27 +156,26 @@ def direct_losses(
     depth, sigma, weight = _measured(rays, decoded, projector, noise)
     p = o + depth[:, None] * d
     with torch.no_grad():
-        near, _, _ = sphere_interval(o, d)
+        near, _ = sphere_interval(o, d)
         before, after = _either_side(near, depth, (_BAND_SIGMAS * sigma).clamp(_LEAST_BAND, _MOST_BAND))
         gap = (depth - before).clamp_min(0)
-    inside = (p.detach().norm(dim=-1) < 1) & (weight > 0)
-    n = len(p)
+    inside, n = (p.detach().norm(dim=-1) < 1) & (weight > 0), len(p)
     sdf, gradient = field.sdf_and_gradient(torch.cat([p.detach(), eikonal_points]))
     at_surface = sdf[:n]
     if p.requires_grad:  # first order in the poses: the slope is a constant
         at_surface = at_surface + (gradient[:n].detach() * (p - p.detach())).sum(-1)
     signs = field.sdf(torch.cat([o + before[:, None] * d, o + after[:, None] * d]).detach())
     counts = weight * inside
+    free_space = (
+        free_space_loss(signs[:n], (0.3 * gap).clamp_max(_MOST_BAND), inside)
+        + 0.3 * behind_loss(signs[n:], inside)
+        + 0.1 * facing_loss(gradient[:n], d.detach(), counts)
+    )
+    with_slope = torch.cat([decoded, torch.ones_like(eikonal_points[:, 0], dtype=torch.bool)])
     return {
         "surface": weights.surface * surface_loss(at_surface, counts, width),
-        "free_space": weights.free_space
-        * (
-            free_space_loss(signs[:n], (0.3 * gap).clamp_max(_MOST_BAND), inside)
-            + 0.3 * behind_loss(signs[n:], inside)
-            + 0.1 * facing_loss(gradient[:n], d.detach(), counts)
-        ),
-        "eikonal": weights.eikonal
-        * eikonal_loss(gradient, torch.cat([decoded, torch.ones_like(eikonal_points[:, 0], dtype=torch.bool)])),
+        "free_space": weights.free_space * free_space,
+        "eikonal": weights.eikonal * eikonal_loss(gradient, with_slope),
     }
 
 

@@ -86,6 +86,11 @@ def level_weights_at(config: AnnealingConfig, levels: int, step: int, total: int
 _LEAST_DESCENT = 0.05  # smallest cosine between ray and surface normal, for grazing rays
 
 
+def _mean(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, ""]:
+    """Mean of the values that count; 0 if none does. A GPU need not tell the host how many they are."""
+    return (values * counts).sum() / counts.sum().clamp_min(1)
+
+
 def coordinate_loss(
     rendered: Float[Tensor, "rays 2"], measured: Float[Tensor, "rays 2"], counts: Bool[Tensor, "rays"]
 ) -> Float[Tensor, ""]:
@@ -93,18 +98,12 @@ def coordinate_loss(
 
     The paper, eq. 9: L1, because decoding errors are outliers.
     """
-    difference = (rendered - measured.nan_to_num()).abs().sum(-1)
-    return (difference * counts).sum() / counts.sum().clamp_min(1)
+    return _mean((rendered - measured.nan_to_num()).abs().sum(-1), counts)
 
 
 def pattern_loss(rendered: Float[Tensor, "rays"], measured: Float[Tensor, "rays"]) -> Float[Tensor, ""]:
     """1 - cosine between rendered and captured intensities of a batch, which match only up to scale."""
     return 1 - torch.nn.functional.cosine_similarity(rendered, measured, dim=0, eps=1e-6)
-
-
-def _mean(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, ""]:
-    """Mean of the values that count; 0 if none does. A GPU need not tell the host how many they are."""
-    return (values * counts).sum() / counts.sum().clamp_min(1)
 
 
 def eikonal_loss(gradient: Float[Tensor, "n 3"], counts: Bool[Tensor, "n"]) -> Float[Tensor, ""]:

@@ -134,7 +134,7 @@ class Renderer:
         """Whether surface points are lit by the projector: nothing is in between, and the surface faces it."""
         to_projector = torch.nn.functional.normalize(projector_centre - p, dim=-1)
         start = p + 2 * self.cache.cell * normal
-        _, far, _ = sphere_interval(start, to_projector)
+        _, far = sphere_interval(start, to_projector)
         zero = torch.zeros_like(far)
         shaded = self._comes_below(start, to_projector, zero, far, _SHADOW_SAMPLES, zero)
         return ~shaded & ((normal * to_projector).sum(-1) > 0)
@@ -159,7 +159,7 @@ class Renderer:
 def _interval(
     origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], ends: Ends | None
 ) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]:
-    near, far, _ = sphere_interval(origins, directions)
+    near, far = sphere_interval(origins, directions)
     return (near, far) if ends is None else (torch.maximum(near, ends[0]), torch.minimum(far, ends[1]))
 
 

@@ -50,31 +50,17 @@ class Pixels:
 
 
 @dataclass(frozen=True)
-class Devices:
-    """Cameras and projector."""
+class Step:
+    """All that a step needs besides the field and the poses. Scalars are on the device."""
 
+    pixels: Pixels
     cameras: Intrinsics  # batch (frames)
     projector: Intrinsics  # batch ()
     pattern: Float[Tensor, "h w"]
-
-
-@dataclass(frozen=True)
-class Current:
-    """What changes from step to step, as scalars on the device, and what the decoding is worth."""
-
     kappa: Float64[Tensor, ""]
     surface_width: Float64[Tensor, ""]
     noise_px: Float[Tensor, ""]
     px_per_length: Float[Tensor, ""]
-
-
-@dataclass(frozen=True)
-class Step:
-    """All that a step needs besides the field and the poses."""
-
-    pixels: Pixels
-    devices: Devices
-    current: Current
     cache: Float[Tensor, "z y x"]  # the cached grid
     sampling: SamplingConfig
     losses: LossConfig
@@ -96,22 +82,17 @@ class Step:
         return self.rendered * self.sampling.samples + 2 * self.direct
 
 
-@dataclass(frozen=True)
-class StepLosses:
-    """The weighted losses of a step by name and, without gradients, how well rays fit what was captured."""
-
-    terms: dict[str, Tensor]
-    coordinate_px: Float[Tensor, ""] | None  # median distance of the coordinates, pattern pixels
-    pattern_cosine: Float[Tensor, ""] | None
-
-
 def step_losses(
     field: MergedField,
     step: Step,
     T_scene_camera: Float[Tensor, "frames 4 4"],
     T_scene_projector: Float[Tensor, "frames 4 4"],
-) -> StepLosses:
-    """The losses, differentiable by the field's parameters and, of the rendered ones only, by the poses."""
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """The weighted losses by name, differentiable by the field's parameters; the rendered ones also by the poses.
+
+    And, if rays are rendered, how well they fit: `coordinate_px`, the median distance of the coordinates in pattern
+    pixels, and `pattern_cosine`.
+    """
     T_scene_projector = T_scene_projector.contiguous()
     moves = T_scene_camera.requires_grad or T_scene_projector.requires_grad
     zeros = _Zeros(len(T_scene_camera) if moves else 0, T_scene_camera)
@@ -127,7 +108,7 @@ def step_losses(
     if step.direct:
         terms |= {"surface": surface, "free_space": free_space}
     terms["eikonal"] = eikonal
-    return StepLosses(terms, px, cosine) if step.rendered else StepLosses(terms, None, None)
+    return terms, {"coordinate_px": px, "pattern_cosine": cosine} if step.rendered else {}
 
 
 class _Zeros:
@@ -152,7 +133,7 @@ class _Points(torch.autograd.Function):
     def forward(
         ctx: Any, step: Step, zeros: _Zeros, T_scene_camera: Tensor, T_scene_projector: Tensor
     ) -> tuple[Tensor, ...]:
-        x, devices, current = step.pixels, step.devices, step.current
+        x = step.pixels
         rays, r, n = len(x.index), step.rendered, step.direct
         m, samples, resolution = step.sampling.eikonal_points, step.sampling.samples, len(step.cache)
         empty = T_scene_camera.new_empty
@@ -161,13 +142,13 @@ class _Points(torch.autograd.Function):
         noise = torch.rand(r * samples + 3 * n + 3 * m, device=origins.device)
         t, points, weight, at_least = empty(r, samples), empty(step.without_gradients + n + m, 3), empty(n), empty(n)
         table = (x.index, x.among, x.frame, x.row, x.column, x.coords, x.pattern)
-        poses = (T_scene_camera, devices.cameras.params, T_scene_projector, devices.projector.params)
-        scalars = (current.kappa, current.noise_px, current.px_per_length)
+        poses = (T_scene_camera, step.cameras.params, T_scene_projector, step.projector.params)
+        scalars = (step.kappa, step.noise_px, step.px_per_length)
         found = (views, origins, directions, measured, captured, t, points, weight, at_least)
         constants = {
             "STRIDES": tuple(column.stride(0) for column in table[2:]),
-            "AMONG": len(x.among) > 0, "CAMERA_DOE": devices.cameras.model == "DOE",
-            "CAMERA_DISTORTED": devices.cameras.distorted, "RENDERS": r > 0, "DIRECT": n > 0,
+            "AMONG": len(x.among) > 0, "CAMERA_DOE": step.cameras.model == "DOE",
+            "CAMERA_DISTORTED": step.cameras.distorted, "RENDERS": r > 0, "DIRECT": n > 0,
             "SURFACE": step.sampling.strategy == "surface", "HALF_WIDTH": HALF_WIDTH,
         }  # fmt: skip
         arrays = (*table, *poses, noise, step.cache, *scalars, *found, rays, r, m, resolution)
@@ -196,14 +177,14 @@ class _Losses(torch.autograd.Function):
         f, slopes, *_ = tensors
         r, sums, found, error = step.rendered, zeros.sums, f.new_empty(7), f.new_empty(step.rendered)
         if r:
-            outputs = (error, sums, r, *step.devices.pattern.shape)
+            outputs = (error, sums, r, *step.pattern.shape)
             _along_rays(step, kernels.render, r, *_rendering(step, tensors), *outputs)
             error = error.sort().values
         size = block(_POINTS, len(slopes))
         arrays = (*_on_points(step, tensors), sums, *_counts(step))
         launch(kernels.direct, triton.cdiv(len(slopes), size), *arrays, BLOCK=size)
         constants = {**_coordinate_weights(step.losses), **_weights_of(step.losses), "PATTERN": step.losses.pattern}
-        launch(kernels.losses, 1, sums, step.current.px_per_length, error, found, **constants, num_warps=1)
+        launch(kernels.losses, 1, sums, step.px_per_length, error, found, **constants, num_warps=1)
         ctx.step, ctx.zeros = step, zeros
         ctx.save_for_backward(*tensors, sums)
         outputs = found.unbind()
@@ -224,10 +205,10 @@ class _Losses(torch.autograd.Function):
         d_rays = (f.new_empty if r == len(origins) else f.new_zeros)(2, len(origins) if by_rays else 0, 3)
         d_T = ctx.zeros.adjoint("projectors", T) if by_pose else f.new_empty(0, 4, 4)
         if r:
-            adjoints = (sums, step.current.px_per_length, *g[:2], d_f, d_rays[0], d_rays[1], d_T)
+            adjoints = (sums, step.px_per_length, *g[:2], d_f, d_rays[0], d_rays[1], d_T)
             constants = {**_coordinate_weights(w), "PATTERN": w.pattern, "RAYS": by_rays, "POSES": by_pose}
-            shape = step.devices.pattern.shape
-            _along_rays(step, kernels.render_adjoint, r, *_rendering(step, tensors), *adjoints, r, *shape, **constants)
+            arrays = (*_rendering(step, tensors), *adjoints, r, *step.pattern.shape)
+            _along_rays(step, kernels.render_adjoint, r, *arrays, **constants)
         size = block(_POINTS, len(slopes))
         arrays = (*_on_points(step, tensors), sums, *g[2:], d_f, d_slopes, *_counts(step))
         launch(kernels.direct_adjoint, triton.cdiv(len(slopes), size), *arrays, **_weights_of(w), BLOCK=size)
@@ -240,9 +221,8 @@ def _along_rays(step: Step, kernel: Any, n: int, *arguments: Any, **constants: A
     columns = triton.next_power_of_2(step.sampling.samples)
     widest = max(columns, CACHE_SAMPLES if kernel is kernels.begin_rays else 1)
     size = block(max(_ELEMENTS // widest, 1), n)
-    projector = step.devices.projector
     if kernel is not kernels.rays_adjoint:
-        constants |= {"DOE": projector.model == "DOE", "DISTORTED": projector.distorted}
+        constants |= {"DOE": step.projector.model == "DOE", "DISTORTED": step.projector.distorted}
     shape = {"SAMPLES": step.sampling.samples, "COLUMNS": columns, "BLOCK": size}
     launch(kernel, triton.cdiv(n, size), *arguments, **constants, **shape)
 
@@ -250,14 +230,14 @@ def _along_rays(step: Step, kernel: Any, n: int, *arguments: Any, **constants: A
 def _rendering(step: Step, tensors: Sequence[Tensor]) -> tuple[Any, ...]:
     """What the kernels along rays read."""
     f, _, origins, directions, T, views, t, measured, captured, *_ = tensors
-    projector = (step.devices.projector.params, step.devices.pattern)
-    return f, t, origins, directions, T, views, *projector, step.current.kappa, measured, captured
+    projector = (step.projector.params, step.pattern)
+    return f, t, origins, directions, T, views, *projector, step.kappa, measured, captured
 
 
 def _on_points(step: Step, tensors: Sequence[Tensor]) -> tuple[Tensor, ...]:
     """What the kernels on triangulated and random points read."""
     f, slopes, _, directions, _, _, _, measured, _, weight, at_least = tensors
-    return f, slopes, directions, measured, weight, at_least, step.current.surface_width
+    return f, slopes, directions, measured, weight, at_least, step.surface_width
 
 
 def _counts(step: Step) -> tuple[int, int, int]:

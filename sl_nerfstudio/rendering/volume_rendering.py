@@ -28,18 +28,16 @@ from sl_nerfstudio.parallel import compiled, compiled_range
 
 
 def sphere_interval(
-    origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"], radius: float = 1.0
-) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"], Bool[Tensor, "rays"]]:
-    """Distances at which unit rays enter and leave the scene's sphere, and whether they meet it in front.
+    origins: Float[Tensor, "rays 3"], directions: Float[Tensor, "rays 3"]
+) -> tuple[Float[Tensor, "rays"], Float[Tensor, "rays"]]:
+    """Distances at which unit rays enter and leave the scene's unit sphere.
 
     A ray that misses it, or grazes it on a chord shorter than the radius, gets an interval as long as the radius around
     its point closest to the centre (in front of the origin), so that everything stays finite.
     """
     b = (origins * directions).sum(-1)
-    discriminant = b * b - (origins * origins).sum(-1) + radius * radius
-    half = discriminant.clamp_min(0.25 * radius * radius).sqrt()
-    near, far = (-b - half).clamp_min(0.0), (-b + half).clamp_min(1e-3)
-    return near, far, (discriminant > 0) & (discriminant.clamp_min(0.0).sqrt() > b)
+    half = (b * b - (origins * origins).sum(-1) + 1).clamp_min(0.25).sqrt()
+    return (-b - half).clamp_min(0.0), (-b + half).clamp_min(1e-3)
 
 
 def uniform_samples(
@@ -71,7 +69,7 @@ def first_crossing(
     return t.gather(1, index[:, None])[:, 0] + share * step, found
 
 
-# Rendering without gradients on the CPU: the formulas of volume_rendering.py and of the cached grid, compiled.
+# Rendering without gradients on the CPU: the formulas of `render` and of the cached grid, compiled.
 #
 # An image has a hundred times the samples of a training step. As torch operations, each of which writes an array as
 # large as all samples, they take ten times as long.
@@ -94,7 +92,7 @@ def render_rays(
     pattern: Float[Tensor, "h w"],
     kappa: Float[Tensor, ""] | float,
 ) -> Float[Tensor, "rays 6"]:
-    """Accumulation, depth, both coordinates, pattern and lit share, as `volume_rendering.render` defines them."""
+    """Accumulation, depth, both coordinates, pattern and lit share, as `render` defines them."""
     found = sdf.new_zeros(len(sdf), 6)
     arrays = [tensor.detach().contiguous().numpy() for tensor in (sdf, t, origins, directions, T_projector_scene)]
     device = MODELS[projector.model].code, projector.params.detach().double().numpy()
@@ -126,7 +124,7 @@ def first_crossings(
     far: Float[Tensor, "rays"],
     count: int,
 ) -> tuple[Float[Tensor, "rays"], Bool[Tensor, "rays"]]:
-    """As `ray_samples.first_crossing`, for a cached grid: the distances, and whether there is one."""
+    """As `first_crossing`, for a cached grid: the distances, and whether there is one."""
     t, found = torch.empty_like(near), torch.zeros(len(near), dtype=torch.bool)
     arrays = [tensor.detach().contiguous().numpy() for tensor in (grid, origins, directions, near, far)]
     _cross(len(near), *arrays, count, t.numpy(), found.numpy())

@@ -15,7 +15,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.files import read_mesh, write_mesh
 from sl_nerfstudio.meshing.mesh import Mesh, VertexProperties
-from sl_nerfstudio.scan import read_scan, write_transforms
+from sl_nerfstudio.scan import PoseSigma, read_scan, write_transforms
 from sl_nerfstudio.storage import held_results
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
@@ -84,9 +84,8 @@ def test_truth_and_true_poses_are_judged_perfect(scan: Path, tmp_path: Path, cap
     assert all(len(line) <= 80 for line in printed.splitlines() if not line.startswith("written"))
     assert np.shape(content["coverage"]["next_capture"]["transform_matrix"]) == (4, 4)
     assert sorted(p.name for p in out.parent.iterdir()) == ["evaluation.json", "report.html"]
-    with held_results(
-        {out: b'"format": 1,\n  "verdict"', page: b"<title>Scan report: "}
-    ):  # earlier results may be replaced
+    marks = {out: b'"format": 1,\n  "verdict"', page: b"<title>Scan report: "}
+    with held_results(marks):  # earlier results may be replaced
         assert "evaluation.json: is in use by" in failure("--mesh", mesh_of(scan), "--data", scan, "--json", out)
 
 
@@ -109,18 +108,8 @@ def test_refined_poses_are_compared_with_the_initial_ones(scan: Path, tmp_path: 
     refined = DevicePoses(known.poses.T_world_camera, known.poses.T_world_projector)
     refined.T_world_camera[1, :3, 3] += [3.0, 0.0, 0.0]
     (tmp_path / "refined").mkdir()
-    sigma = {
-        "camera_translation": 0.5,
-        "camera_rotation_deg": 0.1,
-        "relative_translation": 0.2,
-        "relative_rotation_deg": 0.05,
-    }
-    write_transforms(
-        tmp_path / "refined" / "transforms.json",
-        known,
-        refined,
-        [{"sl_pose_sigma": sigma}] * 3,
-    )
+    sigma = {"sl_pose_sigma": vars(PoseSigma(0.5, 0.1, 0.2, 0.05))}
+    write_transforms(tmp_path / "refined" / "transforms.json", known, refined, [sigma] * 3)
     curves = {"curves": {"step": [0, 1], "loss": [2.0, 1.0]}, "settings": {"seed": 42}, "versions": {"torch": "9.9"}}
     (tmp_path / "refined" / "training.json").write_text(json.dumps(curves))
     out, page = tmp_path / "evaluation.json", tmp_path / "report.html"
@@ -134,9 +123,7 @@ def test_refined_poses_are_compared_with_the_initial_ones(scan: Path, tmp_path: 
 
 
 @pytest.mark.slow
-def test_what_is_not_printed_is_in_the_report_that_was_written_or_could_be(
-    scan: Path, tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_what_is_not_printed_is_in_the_report_that_was_written_or_could_be(scan, tmp_path, capsys):
     known = read_scan(scan)
     wrong = DevicePoses(known.poses.T_world_camera.copy(), known.poses.T_world_projector)
     wrong.T_world_camera[:, :3, 3] += [6.0, 0.0, 0.0]
@@ -199,9 +186,7 @@ def test_a_part_in_other_axes_is_inspected(tmp_path: Path, capsys: pytest.Captur
     assert "there is no nominal surface" in failure(*given[:4], "--tolerance", "0.1 mm")
 
 
-def test_what_cannot_be_evaluated_is_named_and_nothing_is_written(
-    scan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_cannot_be_evaluated_is_named_and_nothing_is_written(scan, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(scan, "scan")
     truth, stated = read_mesh(mesh_of(scan)), scan / "transforms.json"

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import trimesh
 from nerfstudio.scripts import train as ns_train
-from nerfstudio.utils import writer
 from scipy.spatial import KDTree
 from scipy.spatial.distance import pdist
 from viser._messages import ViewerCameraMessage
@@ -29,6 +28,7 @@ from sl_nerfstudio.model.preview import Preview
 from sl_nerfstudio.scan import read_poses, read_scan
 from sl_nerfstudio.scan.images import encode_png, read_image
 from tests.processing.gray_scan import GrayScan, make_gray_scan
+from tests.test_ns_commands import _fresh_writers  # noqa: F401 (nerfstudio's log writers are global)
 
 from .snapshots import call, expect_refusals, succeed
 
@@ -45,14 +45,6 @@ def quick():
         patch.setattr(module, "_CELLS", dict.fromkeys(module._CELLS, 64))
         patch.setenv("SL_CACHE", os.devnull)
         yield
-
-
-@pytest.fixture(autouse=True)
-def _fresh_writers():
-    """nerfstudio keeps its log writers in a module; one training must not write to another's folder."""
-    yield
-    writer.EVENT_WRITERS.clear()
-    writer.GLOBAL_BUFFER.clear()
 
 
 @pytest.fixture(scope="module")
@@ -186,9 +178,9 @@ class Browser(threading.Thread):
 
     def __init__(self, preview: Preview) -> None:
         super().__init__(daemon=True)
-        self.port, self.got = preview._server.get_port(), []
+        self.port, self.got = preview.server.get_port(), []
         self.start()
-        while not preview._server.get_clients():
+        while not preview.server.get_clients():
             time.sleep(0.01)
 
     def run(self) -> None:

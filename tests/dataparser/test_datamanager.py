@@ -5,7 +5,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from PIL import Image
 
 from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
@@ -35,14 +34,8 @@ def test_batch_matches_its_rays(datamanager: SLDataManager) -> None:
     """Independent of the table of pixels: rays hit the sphere where the coordinates in the files say."""
     rays, batch = datamanager.next_train(0)
     loaded = datamanager.dataparser.loaded
-    assert {k: tuple(v.shape) for k, v in batch.items()} == {
-        "indices": (200, 3),
-        "coords": (200, 2),
-        "decoded": (200, 1),
-        "pattern": (200, 1),
-        "image": (200, 3),
-        "mask": (200, 1),
-    }
+    columns = {"indices": 3, "coords": 2, "decoded": 1, "pattern": 1, "image": 3, "mask": 1}
+    assert {name: tuple(values.shape) for name, values in batch.items()} == {k: (200, c) for k, c in columns.items()}
     for i in range(0, 200, 7):
         number, row, column = batch["indices"][i].tolist()
         frame = loaded.scan.frames[number]
@@ -148,15 +141,8 @@ def test_all_cameras_are_at_refined_poses(tiny_root: Path) -> None:
     frame = batch["indices"][:, 0]
     assert rays.metadata["sl_refined"].all()
     torch.testing.assert_close(rays.origins, T[frame, :3, 3])
-    holders = (
-        m.train_dataset,
-        m.eval_dataset,
-        m.train_dataparser_outputs,
-        m.eval_dataset._dataparser_outputs,
-        m.fixed_indices_eval_dataloader,
-        m.eval_dataloader,
-    )
-    for holder in holders:
+    outputs, loaders = m.train_dataparser_outputs, (m.fixed_indices_eval_dataloader, m.eval_dataloader)
+    for holder in (m.train_dataset, m.eval_dataset, outputs, m.eval_dataset._dataparser_outputs, *loaders):
         torch.testing.assert_close(holder.cameras.camera_to_worlds, T[:, :3])
         assert not holder.cameras.camera_to_worlds.requires_grad  # exporters call .numpy()
         assert holder.cameras.generate_rays(0).metadata["sl_refined"].all()
@@ -230,9 +216,3 @@ def test_a_change_in_percent_or_pixels_is_rejected(tiny_root: Path, which: int, 
     a, b, c, d, e, f = (value if which == k else 0.0 for k in range(6))
     with pytest.raises(UserError, match=r"(?s)intrinsics_change \(.*give shares of the focal length"):
         manager(tiny_root, dataparser=SLDataParserConfig(intrinsics_change=IntrinsicsChange.of((a, b, c, d, e, f))))
-
-
-def test_other_dataparsers_are_rejected(tiny_root: Path) -> None:
-    config = SLDataManagerConfig(data=tiny_root, dataparser=NerfstudioDataParserConfig())
-    with pytest.raises(UserError, match="NerfstudioDataParserConfig does not describe a projector"):
-        config.setup(device="cpu")

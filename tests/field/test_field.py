@@ -23,7 +23,7 @@ def gradients(field: SDFField) -> list[Tensor]:
 def reference(p: Tensor, g: Tensor, v: Tensor | None, hidden: int) -> tuple[list[Tensor], list[Tensor]]:
     """Values (f, df/dp) and parameter gradients of `g f + v . grad f`, by torch's double backward in float64."""
     field = make_field("torch", torch.float64, hidden=hidden)
-    field.set_level_weights(WEIGHTS.double())
+    field.encoding.set_level_weights(WEIGHTS.double())
     p = p.clone().requires_grad_()
     f = plain_sdf(field, p)
     (n,) = torch.autograd.grad(f.sum(), p, create_graph=True)
@@ -35,15 +35,13 @@ def reference(p: Tensor, g: Tensor, v: Tensor | None, hidden: int) -> tuple[list
 @pytest.mark.parametrize(("backend", "dtype", "tolerance"), CASES)
 @pytest.mark.parametrize("hidden", [24, 40])
 @pytest.mark.parametrize("of_gradients", [False, True])
-def test_values_and_derivatives_are_those_of_double_backward(
-    backend: str, dtype: torch.dtype, tolerance: float, hidden: int, of_gradients: bool
-) -> None:
+def test_values_and_derivatives_are_those_of_double_backward(backend, dtype, tolerance, hidden, of_gradients):
     """Of values by points and parameters, and of values and gradients by the parameters."""
     p, g = points_around(300), torch.randn(300).double()
     v = torch.randn(300, 3).double() if of_gradients else None
     (f_true, n_true), parameters_true = reference(p, g, v, hidden)
     field = make_field(backend, dtype, hidden=hidden)
-    field.set_level_weights(WEIGHTS.to(dtype))
+    field.encoding.set_level_weights(WEIGHTS.to(dtype))
     q = p.to(dtype).requires_grad_()
     if v is None:
         f = field.sdf(q)
@@ -150,8 +148,12 @@ def test_negligible_points_are_left_out_and_no_others() -> None:
     assert all(bool(x.isnan().any()) for x in gradients(compiled))
 
 
-def test_backward_accumulates_and_starts_from_zero_after_zero_grad() -> None:
-    field, p = make_field("numba"), points_around(100).float()
+COMPILED = pytest.mark.parametrize("backend", ["numba", "triton"])
+
+
+@COMPILED
+def test_backward_accumulates_and_starts_from_zero_after_zero_grad(backend: str) -> None:
+    field, p = make_field(backend), points_around(100).float()
 
     def gradient(times: int) -> Tensor:
         for _ in range(times):
@@ -178,12 +180,13 @@ def test_what_others_write_to_the_tables_gradient_does_not_survive_zero_grad() -
     torch.testing.assert_close(field.encoding.table.grad, once)
 
 
-def test_autograd_grad_returns_the_tables_gradient_and_leaves_grad_alone() -> None:
-    compiled, plain, p = make_field("numba"), make_field("torch"), points_around(100).float()
+@COMPILED
+def test_autograd_grad_returns_the_tables_gradient_and_leaves_grad_alone(backend: str) -> None:
+    compiled, plain, p = make_field(backend), make_field("torch"), points_around(100).float()
     results = []
     for field in (compiled, plain):
         results.append(torch.autograd.grad(field.sdf(p).sum(), list(field.parameters())))
-        assert field.encoding.table.grad is None
+        assert all(x.grad is None for x in field.parameters())
     for a, b in zip(*results, strict=True):
         assert relative(a, b) < 1e-5
 
@@ -218,7 +221,7 @@ def test_a_parameter_changed_between_forward_and_backward_is_detected() -> None:
 
 def test_state_dict_and_copies_carry_the_whole_field() -> None:
     field, p = make_field("numba"), points_around(50).float()
-    field.set_level_weights(WEIGHTS)
+    field.encoding.set_level_weights(WEIGHTS)
     field.sdf(p).sum().backward()
     other = make_field("torch", seed=5)
     other.load_state_dict(field.state_dict())

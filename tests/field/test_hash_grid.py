@@ -58,15 +58,6 @@ def test_a_dense_level_reproduces_a_trilinear_function_exactly() -> None:
     torch.testing.assert_close(value, function(*p.unbind(-1)), atol=1e-12, rtol=0)
 
 
-def test_weights_sum_to_one_and_their_derivatives_are_torchs() -> None:
-    p = (torch.rand(50, 3, dtype=torch.float64) * 2 - 1).requires_grad_()
-    _, weight, slope = corner_weights(SMALL, 1, p)
-    torch.testing.assert_close(weight.sum(1), torch.ones(50, dtype=torch.float64))
-    for corner in range(8):
-        (expected,) = torch.autograd.grad(weight[:, corner].sum(), p, retain_graph=True)
-        torch.testing.assert_close(slope[:, corner], expected)
-
-
 @pytest.mark.parametrize("p", [[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0], [1.0, -1.0, 0.0]])
 def test_the_corner_at_the_border_is_in_the_last_cell(p: list[float]) -> None:
     cell, weight, _ = corner_weights(SMALL, 2, torch.tensor([p], dtype=torch.float64))

@@ -36,20 +36,6 @@ def test_values_and_gradients_evaluated_together_are_those_of_the_plain_field(co
             assert b.numel() == 0 or float((a - b).abs().max()) <= 1e-5 * max(float(b.abs().max()), 1.0)
 
 
-def test_backward_accumulates_and_autograd_grad_leaves_grad_alone() -> None:
-    field, plain, p = make_field("triton"), make_field("torch"), points_around(100).float()
-    for _ in range(2):
-        field.sdf(p).sum().backward()
-        plain.sdf(p).sum().backward()
-    for ours, theirs in zip(field.parameters(), plain.parameters(), strict=True):
-        assert relative(ours.grad, theirs.grad) < 1e-5
-    field.zero_grad()
-    results = [torch.autograd.grad(f.sdf(p).sum(), list(f.parameters())) for f in (field, plain)]
-    for ours, theirs in zip(*results, strict=True):
-        assert relative(ours, theirs) < 1e-5
-    assert all(x.grad is None for x in field.parameters())
-
-
 def test_the_step_of_the_table_is_the_plain_one_and_clears_the_gradient() -> None:
     torch.manual_seed(0)
     ours, plain = nn.Parameter(torch.randn(500, 8)), nn.Parameter(torch.empty(500, 8))
@@ -132,9 +118,7 @@ def test_what_the_backend_cannot_do_is_said_when_it_is_chosen_by_hand(monkeypatc
         (ImportError("libtriton.so: broken"), r"ImportError: libtriton\.so: broken"),
     ],
 )
-def test_a_triton_that_does_not_work_is_said_with_its_cause(
-    error: Exception, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_triton_that_does_not_work_is_said_with_its_cause(error, said, monkeypatch):
     def fails(*_: Any) -> None:
         raise error
 

@@ -40,7 +40,8 @@ def surface(folder: Path) -> np.ndarray:
     metadata = {"sl_scan": loaded.scan, "sl_S_scene_world": loaded.S_scene_world}
     model = SLModel(config, box, len(loaded.scan.frames), metadata=metadata)
     model.train()
-    model.start(loaded.samples)
+    model.adjust_poses(loaded.samples)
+    model.measure_noise(loaded.samples)
     rays = SceneRays(
         loaded.scan, torch.from_numpy(loaded.S_scene_world.poses(loaded.scan.poses.T_world_camera)).float()
     )

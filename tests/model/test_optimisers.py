@@ -1,13 +1,8 @@
 import itertools
-import warnings
 from pathlib import Path
 
 import pytest
 import torch
-
-with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
-    warnings.simplefilter("ignore")
-    import nerfstudio.engine.trainer  # noqa: F401
 
 from sl_nerfstudio.model.optimisers import (
     DecaySchedulerConfig,

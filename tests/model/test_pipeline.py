@@ -1,12 +1,6 @@
 import json
 import math
-import warnings
 from pathlib import Path
-
-with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
-    warnings.simplefilter("ignore")
-    import nerfstudio.engine.trainer
-    import nerfstudio.viewer.viewer  # noqa: F401
 
 from sl_nerfstudio.model.pipeline import mean_over_frames, what_next
 

@@ -41,12 +41,9 @@ pytestmark = pytest.mark.slow
 
 FRAMES, SIZE, MM = 6, 80, 50.0
 S_SCENE_WORLD = Similarity(1 / MM, np.eye(3), np.zeros(3))
+BAR = ScaleBar((PickedPixel("frame_00001", (41.0, 38.5)), PickedPixel("frame_00004", (36.0, 44.0))), 1.0)
 QUICK = AdjustmentSettings(
-    anchors_per_frame=80,
-    frames_per_anchor=3,
-    max_iterations=14,
-    further_searches=False,
-    other_minima=False,
+    anchors_per_frame=80, frames_per_anchor=3, max_iterations=14, further_searches=False, other_minima=False
 )
 
 
@@ -102,8 +99,7 @@ def test_disturbed_poses_are_refined_and_the_known_baseline_is_kept(scan, true):
 def adjusted_poses(scan: Scan, samples: PixelSamples) -> ScanAdjustment:
     """The result of the adjustment without cross-validation."""
     maps, _ = maps_and_held_out(scan, samples)
-    prior = pose_prior(scan, S_SCENE_WORLD, PriorConfig())
-    return adjusted(scan, S_SCENE_WORLD, scene_rig(scan, S_SCENE_WORLD), maps, "free", prior, QUICK)
+    return adjusted(scan, S_SCENE_WORLD, maps, "free", PriorConfig(), QUICK)
 
 
 @pytest.mark.parametrize(
@@ -128,9 +124,8 @@ def in_world(found: ScanAdjustment) -> DevicePoses:
 
 def test_a_scale_bar_has_its_length_after_the_adjustment(scan, true):
     """The lengths of the starting poses are 10 % too small, as the bar shows; its ends are single pixels of 80."""
-    ends = (PickedPixel("frame_00001", (41.0, 38.5)), PickedPixel("frame_00004", (36.0, 44.0)))
-    length = measured_length(scan, ScaleBar(ends, 1.0), scan.poses)
-    bar = ScaleBar(ends, length)
+    length = measured_length(scan, BAR, scan.poses)
+    bar = ScaleBar(BAR.ends, length)
     small = disturbed(true, 1)
     small.T_world_camera[:, :3, 3] *= 0.9
     small.T_camera_projector[:, :3, 3] *= 0.9
@@ -197,13 +192,9 @@ def relative_error(found: ScanAdjustment, true: Rig) -> float:
 def corrected(scan) -> RefinedIntrinsics:
     """Held-out pixels decide once: of repeated decisions on the same pixels one would be positive by chance."""
     with mock.patch.object(messages, "cross_validate", wraps=messages.cross_validate) as decisions:
-        found = _corrected(scan)
+        found = refine_intrinsics(stated_with(scan, CORRECTABLE), UNCHANGED, "free", PriorConfig(), QUICK)
     assert decisions.call_count == 1
     return found
-
-
-def _corrected(scan: Scan) -> RefinedIntrinsics:
-    return refine_intrinsics(stated_with(scan, CORRECTABLE), UNCHANGED, "free", PriorConfig(), QUICK)
 
 
 def cameras_of(scan: Scan) -> list[Device]:
@@ -296,9 +287,6 @@ def test_intrinsics_are_not_refined_without_poses(scan, settings):
     config = settings_for(scan, refine_intrinsics=True, **settings)
     with pytest.raises(UserError, match=r"--pipeline\.model\.refine-intrinsics: .*but the poses are not adjusted"):
         config.prepare()
-
-
-BAR = ScaleBar((PickedPixel("frame_00001", (41.0, 38.5)), PickedPixel("frame_00004", (36.0, 44.0))), 1.0)
 
 
 @pytest.mark.parametrize("scale", [

@@ -54,9 +54,7 @@ def rays(n: int = 60) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize(("strategy", "samples"), [("surface", 64), ("uniform", 2000)])
 @pytest.mark.parametrize("jitter", [False, True])
-def test_rays_see_the_first_surface_and_its_coordinates(
-    strategy: Literal["surface", "uniform"], samples: int, jitter: bool
-) -> None:
+def test_rays_see_the_first_surface_and_its_coordinates(strategy, samples, jitter):
     torch.manual_seed(0)
     o, d = rays(30)
     t = hit(o, d)

@@ -15,7 +15,7 @@ from sl_nerfstudio.geometry.triangulation import pixel_rays
 from sl_nerfstudio.rendering.direct_losses import DecodingNoise, MeasuredRays, direct_losses, field_losses
 from sl_nerfstudio.rendering.losses import LossConfig, coordinate_loss, pattern_loss
 from sl_nerfstudio.rendering.renderer import Renderer, SamplingConfig
-from sl_nerfstudio.rendering.triton_step import Current, Devices, Pixels, Step, StepLosses, step_losses
+from sl_nerfstudio.rendering.triton_step import Pixels, Step, step_losses
 
 PINHOLE = Device(64, 48, 80.0, 82.0, 32.0, 24.0)
 PROJECTORS = {
@@ -85,26 +85,31 @@ def weighted(terms: dict[str, Tensor]) -> Tensor:
     return torch.stack([w * term for w, term in zip((0.3, 2.0, 1.0, 0.7, 1.5), terms.values(), strict=False)]).sum()
 
 
-def ours(name: str, step_of: "Settings", cache: Tensor) -> tuple[StepLosses, list[Tensor], list[str]]:
-    """Losses, gradients of their sum by shape and poses, and the kernels that were launched."""
+Found = tuple[dict[str, Tensor], dict[str, Tensor], list[Tensor]]
+
+
+def ours(name: str, step_of: "Settings", cache: Tensor) -> tuple[Found, list[str]]:
+    """Losses, how well rays fit, gradients of the losses' sum by shape and poses; the kernels that were launched."""
     x, field = scene(name), Bumps(torch.float32)
     pixels = Pixels(x["index"], x["among"], x["frame"], x["row"], x["column"], x["coords"], x["captured"])
-    devices = Devices(Intrinsics.of([CAMERA] * FRAMES), Intrinsics.of(PROJECTORS[name]), x["pattern"])
+    devices = (Intrinsics.of([CAMERA] * FRAMES), Intrinsics.of(PROJECTORS[name]), x["pattern"])
     width = WIDTH if step_of.losses.direct else 0.0  # as in a training
     scalars = [torch.tensor(value, dtype=torch.float64) for value in (25.0, width)]
     scalars += [torch.tensor(value) for value in (NOISE.px, NOISE.px_per_length)]
-    step = Step(pixels, devices, Current(*scalars), cache, step_of.sampling, step_of.losses, step_of.renders)
+    step = Step(pixels, *devices, *scalars, cache, step_of.sampling, step_of.losses, step_of.renders)
     poses = moving(x, torch.float32)
     torch.manual_seed(1)
     with launches() as kernels:
-        found = step_losses(field, step, *poses)
-        weighted(found.terms).backward()
-    return found, [torch.zeros_like(y) if y.grad is None else y.grad for y in (field.shape, *poses)], kernels
+        terms, fit = step_losses(field, step, *poses)
+        weighted(terms).backward()
+    return (terms, fit, gradients_of(field, poses)), kernels
 
 
-def plain(
-    name: str, step_of: "Settings", cache: CachedGrid
-) -> tuple[dict[str, Tensor], dict[str, Tensor], list[Tensor]]:
+def gradients_of(field: Bumps, poses: tuple[Tensor, Tensor]) -> list[Tensor]:
+    return [torch.zeros_like(y) if y.grad is None else y.grad for y in (field.shape, *poses)]
+
+
+def plain(name: str, step_of: "Settings", cache: CachedGrid) -> Found:
     """The same by the plain operations in double precision, with the same random numbers."""
     x, field = scene(name), Bumps(torch.float64)
     index, sampling, weights = x["among"][x["index"]].long(), step_of.sampling, step_of.losses
@@ -128,8 +133,9 @@ def plain(
         scale = weights.coordinates_per_pixel or weights.coordinates / float(NOISE.px_per_length)
         terms["coordinates"] = scale * coordinate_loss(seen.coordinates, measured[:r], counts)
         terms["pattern"] = weights.pattern * pattern_loss(seen.pattern, x["captured"][index][:r].double())
-        fit["px"] = (seen.coordinates - measured[:r]).norm(dim=-1)[measured[:r, 0].isfinite()].median()
-        fit["cosine"] = torch.nn.functional.cosine_similarity(seen.pattern, x["captured"][index][:r].double(), dim=0)
+        fit["coordinate_px"] = (seen.coordinates - measured[:r]).norm(dim=-1)[measured[:r, 0].isfinite()].median()
+        captured = x["captured"][index][:r].double()
+        fit["pattern_cosine"] = torch.nn.functional.cosine_similarity(seen.pattern, captured, dim=0)
     points = ball(others.view(-1, 3))
     if direct:
         decoded = measured[:, 0].isfinite()
@@ -143,7 +149,7 @@ def plain(
     else:
         terms |= field_losses(field, points, weights)
     weighted(terms).backward()
-    return terms, fit, [torch.zeros_like(y) if y.grad is None else y.grad for y in (field.shape, *poses)]
+    return terms, fit, gradients_of(field, poses)
 
 
 def ball(noise: Tensor) -> Tensor:
@@ -188,14 +194,12 @@ def test_losses_and_gradients_of_a_step_are_those_of_the_plain_operations(kind: 
     z, y, x = torch.meshgrid(*[torch.linspace(-1, 1, 48, dtype=torch.float64)] * 3, indexing="ij")
     cache.values.copy_(Bumps(torch.float64).sdf(torch.stack([x, y, z], -1).view(-1, 3)).detach().view(48, 48, 48))
     expected, fit, expected_gradients = plain(name, STEPS[kind], cache)
-    found, gradients, kernels = ours(name, STEPS[kind], cache.values.float())
-    assert list(found.terms) == list(expected)
+    (terms, found_fit, gradients), kernels = ours(name, STEPS[kind], cache.values.float())
+    assert list(terms) == list(expected) and list(found_fit) == list(fit)
     for term, value in expected.items():
-        assert float((found.terms[term] - value).abs().detach() / value.detach().abs()) < 2e-5, term
-    assert (found.coordinate_px is None) == (found.pattern_cosine is None) == (not fit)
-    if fit:
-        torch.testing.assert_close(found.coordinate_px.double(), fit["px"].detach(), rtol=1e-4, atol=0)
-        torch.testing.assert_close(found.pattern_cosine.double(), fit["cosine"].detach(), rtol=1e-5, atol=0)
+        assert float((terms[term] - value).abs().detach() / value.detach().abs()) < 2e-5, term
+    for (measure, value), rtol in zip(fit.items(), (1e-4, 1e-5), strict=False):
+        torch.testing.assert_close(found_fit[measure].double(), value.detach(), rtol=rtol, atol=0)
     for what, got, wanted in zip(("shape", "cameras", "projectors"), gradients, expected_gradients, strict=True):
         tolerance = 1e-4 if what == "shape" else 1e-3  # slopes of the pattern at coordinates in single precision
         assert float((got - wanted).abs().max()) <= tolerance * float(wanted.abs().max()), what

@@ -5,7 +5,6 @@ import functools
 import os
 import signal
 import sys
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -14,10 +13,8 @@ from typing import Any
 
 import pytest
 import torch
-
-with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
-    warnings.simplefilter("ignore")
-    from nerfstudio.scripts import train as ns_train
+import yaml
+from nerfstudio.scripts import train as ns_train
 
 from sl_nerfstudio.methods import sl_neus
 from sl_nerfstudio.model.run_files import INTERRUPTION
@@ -56,6 +53,14 @@ def go_on(config_yml: Path) -> None:
     config = copy.deepcopy(sl_neus.config)
     config.load_config = config_yml
     ns_train.main(config)
+
+
+def edited(folder: Path, change: Callable[[Any], object]) -> Path:
+    """The config.yml of a run, after a change of its settings."""
+    config = yaml.load((folder / "config.yml").read_text(), Loader=yaml.Loader)
+    change(config)
+    (folder / "config.yml").write_text(yaml.dump(config))
+    return folder / "config.yml"
 
 
 def last_state(folder: Path) -> dict[str, Any]:

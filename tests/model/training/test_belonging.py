@@ -4,26 +4,20 @@ import json
 import os
 import shutil
 import signal
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import yaml
-
-with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
-    warnings.simplefilter("ignore")
-    from nerfstudio.scripts.viewer import run_viewer
-    from nerfstudio.utils.eval_utils import eval_setup
+from nerfstudio.scripts.viewer import run_viewer
+from nerfstudio.utils.eval_utils import eval_setup
 
 from sl_nerfstudio.cli.check import check_run_folder
 from sl_nerfstudio.dataparser.dataparser import scan_fingerprint
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.runs.run import load_run
 from sl_nerfstudio.scan import read_scan
-from tests.model.training.small_runs import folder_of, last_state, send, settings, status, train
+from tests.model.training.small_runs import edited, folder_of, last_state, send, settings, status, train
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 
@@ -82,13 +76,6 @@ def test_a_scan_that_was_only_moved_is_taken(scan_root, copy, tmp_path):
     resumed = settings(moved, tmp_path / "new", steps=1, load_dir=copy / "nerfstudio_models")
     train(resumed)
     assert last_state(tmp_path / "new" / "elsewhere" / "sl-neus" / "first")["step"] == 12
-
-
-def edited(copy: Path, change: Callable[[object], None]) -> Path:
-    config = yaml.load((copy / "config.yml").read_text(), Loader=yaml.Loader)
-    change(config)
-    (copy / "config.yml").write_text(yaml.dump(config))
-    return copy / "config.yml"
 
 
 def test_settings_that_were_edited_are_refused(copy):

@@ -7,17 +7,13 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
-
-with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
-    warnings.simplefilter("ignore")
-    from nerfstudio.engine.trainer import Trainer
+from nerfstudio.engine.trainer import Trainer
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.model.model import SLModel

@@ -12,20 +12,13 @@ from sl_nerfstudio.field.device_kernels import launches
 from sl_nerfstudio.geometry.lie import exp_se3
 from sl_nerfstudio.model.kernel_step import device_poses
 from sl_nerfstudio.model.poses import PoseParameters
-from tests.dataparser.tiny_scan import TinyScan
+from tests.model.test_poses import KINDS
 
 FRAMES = 5
-KINDS = [
-    {},
-    {"shared_projector": True},
-    {"projector_moves_by": "nothing", "refine_projector": False},
-    {"projector_moves_by": "own pose", "about_scene": False},
-    {"about_scene": False, "shared_projector": True},
-]
 
 
 @pytest.mark.parametrize("size", [1e-6, 0.05, 1.0])  # series below 0.3 rad
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", [*KINDS, {"about_scene": False, "shared_projector": True}])
 def test_poses_and_adjoints_of_all_parametrisations_are_torchs(kind: dict[str, Any], size: float) -> None:
     torch.manual_seed(0)
     bases = exp_se3(torch.randn(2, FRAMES, 6, dtype=torch.float64))
@@ -45,11 +38,6 @@ def test_poses_and_adjoints_of_all_parametrisations_are_torchs(kind: dict[str, A
 
     for got, wanted in zip(pulled(found), pulled(expected), strict=True):
         torch.testing.assert_close(got, wanted, atol=1e-5, rtol=1e-5)
-
-
-@pytest.fixture(scope="module")
-def scan_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return TinyScan(undecoded=0.05).write(tmp_path_factory.mktemp("scans") / "sphere")
 
 
 def training(method: str, backend: str, scan_root: Path, folder: Path) -> Training:

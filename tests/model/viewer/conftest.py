@@ -10,10 +10,7 @@ import numpy as np
 import pytest
 import torch
 import viser
-
-with warnings.catch_warnings():  # warnings are errors, but these are nerfstudio's own
-    warnings.simplefilter("ignore")
-    from nerfstudio.viewer.viewer import Viewer
+from nerfstudio.viewer.viewer import Viewer
 
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 from sl_nerfstudio.model import viewer

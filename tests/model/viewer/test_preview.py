@@ -41,7 +41,7 @@ def test_frames_that_were_left_out_are_not_drawn_and_what_is_drawn_is_in_view(pa
         f"/{kind}/{clouds[k].name}" for kind in ("cameras", "points", "projectors") for k in (0, 2)
     ]
     assert "2 of 3 frames adjusted together" in page._said.content
-    queued = page._server._websock_server._broadcast_buffer.message_from_id.values()
+    queued = page.server._websock_server._broadcast_buffer.message_from_id.values()
     points = np.concatenate([m.points for m in queued if type(m).__name__ == "PointCloudMessage"])
     assert 1000 < len(points) <= MOST_POINTS
     assert np.linalg.norm(points, axis=1).max() < 1.5 * SCENE_SCALE
