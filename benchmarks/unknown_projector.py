@@ -153,9 +153,10 @@ def run(options: SetOptions) -> Row:
     sigma = sigma_of_fields(estimate.projector, estimate.covariance)
     found = FoundProjector(estimate.projector, sigma, len(estimate.frames), estimate.noise_px, "epipolar geometry")
     clouds, consistent = processed(made, found.projector, found)
-    refined = refine_projector(clouds, consistent, found, CERTAIN, adjustment_settings("free", found), lambda _: None)
-    error = surface_error(made, refined.clouds, refined.consistent)
-    return Row(options.scene, options.seed, options.frames, *_errors(found, true), *_errors(refined.found, true),
+    settings = adjustment_settings("free", found)
+    clouds, consistent, refined = refine_projector(clouds, consistent, found, CERTAIN, settings, lambda _: None)
+    error = surface_error(made, clouds, consistent)
+    return Row(options.scene, options.seed, options.frames, *_errors(found, true), *_errors(refined, true),
                round(known, 5), round(error, 5), round(error / known, 3))  # fmt: skip
 
 

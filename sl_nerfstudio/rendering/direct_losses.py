@@ -99,11 +99,12 @@ def _measure(first, last, origins, directions, poses, others, decoded, code, par
             found[2, k] = min(max(slope / usual, 0.1), 2.0)
 
 
-_GATE = 4.0  # sigmas of the epipolar residual beyond which a decoding counts as wrong
-_BAND_SIGMAS, _LEAST_BAND, _MOST_BAND = 4.0, 0.006, 0.03
+GATE = 4.0  # sigmas of the epipolar residual beyond which a decoding counts as wrong
+BAND_SIGMAS, LEAST_BAND, MOST_BAND = 4.0, 0.006, 0.03
 """Closer to the measured surface than this, in sigmas of its depth and within bounds in scene units, no sign is
 required. A wider band would allow a surface that is folded within it and passes through the points inside out."""
-_NEAR_SHARE, _NEAR_BANDS = 0.5, 4.0  # this share of the points in front is within so many bands of the surface
+NEAR_SHARE, NEAR_BANDS = 0.5, 4.0  # this share of the points in front is within so many bands of the surface
+BEHIND, FACING = 0.3, 0.1  # weights of the sign behind the surface, and of its normal, among the terms of free space
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,7 @@ def direct_losses(
     p = o + depth[:, None] * d
     with torch.no_grad():
         near, _ = sphere_interval(o, d)
-        before, after = _either_side(near, depth, (_BAND_SIGMAS * sigma).clamp(_LEAST_BAND, _MOST_BAND))
+        before, after = _either_side(near, depth, (BAND_SIGMAS * sigma).clamp(LEAST_BAND, MOST_BAND))
         gap = (depth - before).clamp_min(0)
     inside, n = (p.detach().norm(dim=-1) < 1) & (weight > 0), len(p)
     sdf, gradient = field.sdf_and_gradient(torch.cat([p.detach(), eikonal_points]))
@@ -167,9 +168,9 @@ def direct_losses(
     signs = field.sdf(torch.cat([o + before[:, None] * d, o + after[:, None] * d]).detach())
     counts = weight * inside
     free_space = (
-        free_space_loss(signs[:n], (0.3 * gap).clamp_max(_MOST_BAND), inside)
-        + 0.3 * behind_loss(signs[n:], inside)
-        + 0.1 * facing_loss(gradient[:n], d.detach(), counts)
+        free_space_loss(signs[:n], (0.3 * gap).clamp_max(MOST_BAND), inside)
+        + BEHIND * behind_loss(signs[n:], inside)
+        + FACING * facing_loss(gradient[:n], d.detach(), counts)
     )
     with_slope = torch.cat([decoded, torch.ones_like(eikonal_points[:, 0], dtype=torch.bool)])
     return {
@@ -185,8 +186,8 @@ def _either_side(
     """Random distances along rays: anywhere in front of the band around a measured depth, and just behind it."""
     u, v = torch.rand(2, *depth.shape, device=depth.device)
     anywhere = near + (depth - band - near).clamp_min(0) * u
-    close = (depth - band * (1 + (_NEAR_BANDS - 1) * u)).maximum(near)
-    return torch.where(torch.rand_like(depth) < _NEAR_SHARE, close, anywhere), depth + band * (1 + v)
+    close = (depth - band * (1 + (NEAR_BANDS - 1) * u)).maximum(near)
+    return torch.where(torch.rand_like(depth) < NEAR_SHARE, close, anywhere), depth + band * (1 + v)
 
 
 def _measured(
@@ -199,7 +200,7 @@ def _measured(
     directions = unproject(projector, uv)
     if compiled_measures(o, d, T_scene_projector, directions):
         px, px_per_length = float(noise.px), float(noise.px_per_length)
-        return measured((o, d), T_scene_projector, directions, decoded, projector, px, px_per_length, _GATE)
+        return measured((o, d), T_scene_projector, directions, decoded, projector, px, px_per_length, GATE)
     d_projector = rotate(T_scene_projector, directions)
     o_projector = T_scene_projector[:, :3, 3]
     depth, depth_projector = closest_approach(o, d, o_projector, d_projector)
@@ -210,7 +211,7 @@ def _measured(
         offset = (o_projector + depth_projector[:, None] * d_projector) - p
         gap_px = (J * rotate(T, offset)[:, None, :]).sum(-1).norm(dim=-1)
         slope = (J * rotate(T, d)[:, None, :]).sum(-1).norm(dim=-1)  # pixels per length
-        good = decoded & (gap_px < _GATE * noise.px) & (depth > 0) & (depth_projector > 0)
+        good = decoded & (gap_px < GATE * noise.px) & (depth > 0) & (depth_projector > 0)
         weight = good * (slope / noise.px_per_length).clamp(0.1, 2.0)
         sigma = noise.px / slope.clamp_min(1e-9)
     return torch.nan_to_num(depth, nan=1.0), torch.nan_to_num(sigma), torch.nan_to_num(weight)

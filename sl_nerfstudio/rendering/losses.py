@@ -83,7 +83,7 @@ def level_weights_at(config: AnnealingConfig, levels: int, step: int, total: int
     return (0.5 - 0.5 * torch.cos(math.pi * ramp)).float()
 
 
-_LEAST_DESCENT = 0.05  # smallest cosine between ray and surface normal, for grazing rays
+LEAST_DESCENT = 0.05  # smallest cosine between ray and surface normal, for grazing rays
 
 
 def _mean(values: Float[Tensor, "n"], counts: Bool[Tensor, "n"]) -> Float[Tensor, ""]:
@@ -143,4 +143,4 @@ def facing_loss(
     inside out through the measured points: |f| and the Eikonal term do not prevent that.
     """
     rise = (gradient * direction).sum(-1)
-    return (weight * (rise + _LEAST_DESCENT).clamp_min(0)).sum() / weight.sum().clamp_min(1e-9)
+    return (weight * (rise + LEAST_DESCENT).clamp_min(0)).sum() / weight.sum().clamp_min(1e-9)

@@ -24,7 +24,8 @@ from sl_nerfstudio.field.triton_vectors import (
     summed,
     vector,
 )
-from sl_nerfstudio.rendering.renderer import CACHE_SAMPLES as _CACHE_SAMPLES
+from sl_nerfstudio.rendering import direct_losses, renderer
+from sl_nerfstudio.rendering import losses as plain_losses
 from sl_nerfstudio.rendering.triton_devices import (
     cached,
     intrinsics,
@@ -37,12 +38,12 @@ from sl_nerfstudio.rendering.triton_devices import (
     unproject,
 )
 
-CACHE_SAMPLES = tl.constexpr(_CACHE_SAMPLES)
-_GATE = tl.constexpr(4.0)  # these seven as in direct_losses.py
-_BAND_SIGMAS, _LEAST_BAND, _MOST_BAND = tl.constexpr(4.0), tl.constexpr(0.006), tl.constexpr(0.03)
-_NEAR_SHARE, _NEAR_BANDS = tl.constexpr(0.5), tl.constexpr(4.0)
-_BEHIND, _FACING = tl.constexpr(0.3), tl.constexpr(0.1)
-_LEAST_DESCENT, _EPSILON = tl.constexpr(0.05), tl.constexpr(1e-6)  # as in losses.py
+CACHE_SAMPLES = tl.constexpr(renderer.CACHE_SAMPLES)
+_GATE, _BAND_SIGMAS = tl.constexpr(direct_losses.GATE), tl.constexpr(direct_losses.BAND_SIGMAS)
+_LEAST_BAND, _MOST_BAND = tl.constexpr(direct_losses.LEAST_BAND), tl.constexpr(direct_losses.MOST_BAND)
+_NEAR_SHARE, _NEAR_BANDS = tl.constexpr(direct_losses.NEAR_SHARE), tl.constexpr(direct_losses.NEAR_BANDS)
+_BEHIND, _FACING = tl.constexpr(direct_losses.BEHIND), tl.constexpr(direct_losses.FACING)
+_LEAST_DESCENT, _EPSILON = tl.constexpr(plain_losses.LEAST_DESCENT), tl.constexpr(1e-6)
 
 _kernel = partial(triton.jit, do_not_specialize=["rays", "rendered", "others", "n", "start", "resolution"])
 
