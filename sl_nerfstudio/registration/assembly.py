@@ -9,7 +9,6 @@ when all are in (see blocks).
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -31,8 +30,6 @@ MOST_PAIRS = 10  # of frames across two components that are compared
 MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
 BASELINE_SIGMA = 0.5  # of the logarithm of a ratio of baselines: nobody moves two devices much farther apart
 LARGEST_BASELINE = 5.0  # such a ratio, beyond which a surface has collapsed onto a patch of another
-NEARLY_SAME_SHIFT = 0.01  # radii, between two places of which evidence is asked only once
-NEARLY_SAME_TRACE = 1 + 2 * np.cos(np.radians(0.5))  # of the rotation between them
 LEAST_SIGHT_COSINE = float(np.cos(np.radians(75.0)))  # between lines of sight: beyond it frames share no surface
 
 
@@ -84,7 +81,6 @@ class Assembly:
         """
         self._scan, self.pivots, self.prior = scan, pivots, prior
         self.edges = sorted(edges, key=lambda e: -e.lead)
-        self._asked: dict[tuple[int, int], list[tuple[tuple[Similarity | None, ...], Comparison]]] = {}
         self._decisions: dict[tuple[int, int], Decision | None] = {}  # by the numbers of two components
         self.components: list[Component] = [{k: Similarity.identity()} for k in range(len(pivots))]
         self._number = list(range(len(pivots)))  # of each frame's component
@@ -257,7 +253,7 @@ class Assembly:
         degree = {k: max(count[k] for count in counts) for k in set().union(*counts)}
         for i, j in sorted(set().union(*near)):
             here = [relative(at, j, i) if see_same_side(at[i], at[j]) else None for at in nodes]
-            found += self._comparison(j, i, here).scaled(2 / (degree[i] + degree[j]))
+            found += self._scan.comparison(j, i, here).scaled(2 / (degree[i] + degree[j]))
         found += self._by_tone(first, second, nodes)
         found += by_odds([self._usual_baselines(first, second, at) for at in nodes])
         return replace(found, alike=found.alike | alike)
@@ -289,30 +285,13 @@ class Assembly:
             return False
         said = 0.0
         for i, j in facing_after(nodes, turn):
-            found = self._comparison(j, i, [relative(nodes, j, i), nodes[i].inverse() @ turn @ nodes[j]])
+            found = self._scan.comparison(j, i, [relative(nodes, j, i), nodes[i].inverse() @ turn @ nodes[j]])
             if found.alike[0, 1]:
                 said += LEAST_ODDS
             else:
                 contradicted = replace(found, alike=np.ones((2, 2), dtype=bool)).leads[0, 1]
                 said -= min(abs(float(contradicted)), MOST_AGAINST)
         return said > 0
-
-    def _comparison(self, source: int, target: int, places: Sequence[Similarity | None]) -> Comparison:
-        """Compare places of two frames; as before where nearly the same were compared: evidence looks around each."""
-        asked = self._asked.setdefault((source, target), [])
-        for before, found in asked:
-            if len(before) == len(places) and all(map(partial(self._nearly_same, source), before, places)):
-                return found
-        asked.append((tuple(places), self._scan.comparison(source, target, places)))
-        return asked[-1][1]
-
-    def _nearly_same(self, frame: int, a: Similarity | None, b: Similarity | None) -> bool:
-        """Whether two similarities put a frame at nearly the same place."""
-        if a is None or b is None:
-            return a is b
-        centre, radius = self.pivots.centre[frame][None], a.scale * self.pivots.radius[frame]
-        shift = max(np.linalg.norm(a.points(centre) - b.points(centre)) / radius, abs(np.log(a.scale / b.scale)))
-        return bool(shift < NEARLY_SAME_SHIFT and (a.R * b.R).sum() > NEARLY_SAME_TRACE)
 
     @staticmethod
     def _fits_as_well(e: PairMatch, nodes: Component, turn: Similarity) -> bool:

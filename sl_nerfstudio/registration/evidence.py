@@ -76,6 +76,9 @@ NEAR_THINNED = 3  # only each so-manieth point is used to find the most likely p
 NEAR_WIDTHS = (10.0, 7.0, 5.0, 4.0)  # of the kernel on the way there, sigmas
 NEAR_DEG, NEAR_SHIFT = 2.0, 0.08  # how far that may be: degrees, radii
 NEAR_SIGMAS = 3.0  # and what errors of both relative poses explain
+NEARLY_SAME_SHIFT = 0.01  # radii, between two places of which evidence is asked only once
+NEARLY_SAME_TRACE = 1 + 2 * np.cos(np.radians(0.5))  # of the rotation between them
+MOST_KEPT = 4000  # places of which residuals are kept, of 36 kB each
 
 CONTRADICTING_SIGMAS = 3.0  # behind the surface, from which it is asked whether an edge hides a point
 STEEPEST = 5.0  # change of distance from place to place, in their width, beyond which a surface has an edge
@@ -441,6 +444,12 @@ class Compared:
         """Some of the places."""
         return replace(self, z=self.z[index], codes=self.codes[index], spread=self.spread[index])
 
+    @staticmethod
+    def joined(parts: Sequence["Compared"]) -> "Compared":
+        """All places of several."""
+        z, codes, spread = (np.concatenate([getattr(p, name) for p in parts]) for name in ("z", "codes", "spread"))
+        return Compared(z, codes, spread, parts[0].indistinct)
+
     def noise(self, k: int, points: slice) -> float:
         """How much larger the residuals of some points are at a place than stated; within limits."""
         size = np.abs(self.z[k, points][self.codes[k, points] == JUDGED])
@@ -714,6 +723,8 @@ class ScanEvidence:
         self, frames: Sequence[FrameEvidence], common: Sequence[Commonness], noise: Float64[ndarray, "n"]
     ) -> None:
         self.frames, self.common, self.noise = frames, common, noise
+        self._compared: dict[tuple[int, int], list[tuple[Similarity, Compared]]] = {}  # places, each as it was found
+        self._kept = 0
 
     def comparison(self, source: int, target: int, places: Sequence[Similarity | None]) -> Comparison:
         """Compare places of two frames; None: there the frames do not face each other."""
@@ -743,19 +754,47 @@ class ScanEvidence:
         return float(odds[0]), float(agreeing), float(expected)
 
     def _near(self, source: int, target: int, places: Sequence[Similarity]) -> tuple[PairEvidence, Compared] | None:
-        """Residuals at the most likely place close to each; None if a frame has no points."""
+        """Residuals at the most likely place close to each; None if a frame has no points.
+
+        Where nearly the same place was compared before they are kept: the search looks around each all the same.
+        """
         a, b = self.frames[source], self.frames[target]
-        if not (len(a.points) and len(b.points)):
+        if not (places and len(a.points) and len(b.points)):
             return None
-        start = Places.of(*places)
-        few, every = PairEvidence(a, b, NEAR_THINNED), PairEvidence(a, b)
-        near, _ = few.refined(start, NEAR_WIDTHS)
+        before = self._compared.get((source, target), [])
+        known = [next((found for S, found in before if nearly_same(a, S, place)), None) for place in places]
+        new = [place for place, found in zip(places, known, strict=True) if found is None]
+        every = PairEvidence(a, b)
+        if new:
+            noise = float(self.noise[source]), float(self.noise[target])
+            found = every.scaled(every.compare(self._likeliest_near(a, b, Places.of(*new))), noise)
+            rows = [found.chosen(np.array([k])) for k in range(len(new))]
+            if self._kept > MOST_KEPT:
+                self._compared.clear()
+                self._kept = 0
+            self._compared.setdefault((source, target), []).extend(zip(new, rows, strict=True))
+            self._kept += len(new)
+            following = iter(rows)
+            known = [next(following) if found is None else found for found in known]
+        return every, Compared.joined([found for found in known if found is not None])
+
+    @staticmethod
+    def _likeliest_near(a: FrameEvidence, b: FrameEvidence, start: Places) -> Places:
+        """The most likely place close to each, or the place itself if the search leaves it."""
+        near, _ = PairEvidence(a, b, NEAR_THINNED).refined(start, NEAR_WIDTHS)
         turned = np.degrees(np.arccos(np.clip((np.einsum("kij,kij->k", near.R, start.R) - 1) / 2, -1, 1)))
         p = np.einsum("kji,kj->ki", start.R, b.centroid - start.t) / start.scale[:, None]
         shift = near.scale[:, None] * np.einsum("kij,kj->ki", near.R, p) + near.t - b.centroid
         by_poses = NEAR_SIGMAS * np.hypot(start.scale * a.depth_sigma, b.depth_sigma)
         left = (turned > NEAR_DEG) | (np.linalg.norm(shift, axis=1) > NEAR_SHIFT * b.radius + by_poses)
         both = Places.joined([start, near])
-        chosen = both[np.where(left, 0, len(start)) + np.arange(len(start))]
-        noise = float(self.noise[source]), float(self.noise[target])
-        return every, every.scaled(every.compare(chosen), noise)
+        return both[np.where(left, 0, len(start)) + np.arange(len(start))]
+
+
+def nearly_same(source: FrameEvidence, S: Similarity, place: Similarity) -> bool:
+    """Whether two similarities put a frame at nearly the same place."""
+    if (S.R * place.R).sum() <= NEARLY_SAME_TRACE or abs(np.log(S.scale / place.scale)) > NEARLY_SAME_SHIFT:
+        return False
+    centre = source.centroid[None]
+    moved = np.linalg.norm(S.points(centre) - place.points(centre))
+    return bool(moved < NEARLY_SAME_SHIFT * place.scale * source.radius)
