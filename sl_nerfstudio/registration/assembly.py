@@ -27,6 +27,8 @@ from sl_nerfstudio.registration.pose_graph import Component, Pivots, optimise_at
 
 MOST_COMPARED = 12  # clearly different similarities between two components
 MOST_PAIRS = 10  # of frames across two components that are compared
+MOST_ALIKE = 4  # frames that each faces at a place, by which blocks of what looks alike are found
+ADJUSTED_DEG = 6.0  # between two places, up to which the joint adjustment leads from one to the other
 MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
 BASELINE_SIGMA = 0.5  # of the logarithm of a ratio of baselines: nobody moves two devices much farther apart
 LARGEST_BASELINE = 5.0  # such a ratio, beyond which a surface has collapsed onto a patch of another
@@ -175,6 +177,7 @@ class Assembly:
     def elsewhere(self, rest: Component, frame: int, here: Similarity) -> list[Elsewhere]:
         """Clearly different places of one frame of a component that its pairs say, if they may be about as likely.
 
+        A place beside one at which the surface looks the same is judged as that one: it has slid from there.
         `rest`: the other frames of the component, `here`: the frame's node.
         """
         second = {frame: here}
@@ -187,15 +190,17 @@ class Assembly:
         usual = [self.usual(rest, second, at) for at in nodes]
         if_not, if_so = (replace(found, alike=np.full_like(found.alike, so)).leads[:, 0] for so in (False, True))
         either = np.maximum(found.leads[:, 0], if_so)
+        turns = [at[frame] @ nodes[0][frame].inverse() for at in nodes]
         out: list[Elsewhere] = []
         for k in range(1, len(places)):
             order = usual[k] - usual[0]
             unlikely = found.odds[k] < LEAST_ODDS or either[k] + max(order, 0) <= -LEAST_ODDS
             if unlikely or not self.differ(rest, second, nodes[0], nodes[k]):
                 continue
-            turn = nodes[k][frame] @ nodes[0][frame].inverse()
-            alike = if_not[k] != if_so[k] and self.looks_alike(rest, turn)
-            out.append(Elsewhere(turn, float(if_so[k] if alike else if_not[k]), order))
+            alike = if_not[k] != if_so[k] and any(
+                self.looks_alike(rest, turn) for turn in turns[1:] if angle_deg(turn.R @ turns[k].R.T) < ADJUSTED_DEG
+            )
+            out.append(Elsewhere(turns[k], float(if_so[k] if alike else if_not[k]), order))
         return out
 
     def _proposed(self, first: Component, second: Component) -> list[Similarity]:
@@ -292,6 +297,30 @@ class Assembly:
                 contradicted = replace(found, alike=np.ones((2, 2), dtype=bool)).leads[0, 1]
                 said -= min(abs(float(contradicted)), MOST_AGAINST)
         return said > 0
+
+    def gains_among_alike(self, nodes: Component, turn: Similarity) -> Float64[ndarray, "m m"]:
+        """What a turn after which the surface looks the same gains if one frame (row) moves and another stays, nats.
+
+        By the frames that face each other best as they are, or after one of both is moved.
+        """
+        frames, gain = list(nodes), np.zeros((len(nodes), len(nodes)))
+        sight = np.array([S.R[:, 2] for S in nodes.values()])
+        after = sight @ turn.R.T @ sight.T  # the first moves
+        rows, near = np.arange(len(frames))[:, None], np.zeros(gain.shape, dtype=bool)
+        for cosine in (sight @ sight.T, after, after.T.copy()):
+            np.fill_diagonal(cosine, -1.0)
+            best = np.argsort(cosine, axis=1, kind="stable")[:, -MOST_ALIKE:]
+            near[rows, best] |= np.take_along_axis(cosine, best, 1) > LEAST_SIGHT_COSINE
+        near |= near.T
+        degree = near.sum(1)
+        for a, b in zip(*np.nonzero(np.triu(near, 1)), strict=True):
+            i, j = nodes[frames[a]], nodes[frames[b]]
+            worlds = ((i, j), (turn @ i, j), (i, turn @ j))
+            places = [q.inverse() @ p if see_same_side(p, q) else None for p, q in worlds]
+            found = self._scan.comparison(frames[a], frames[b], places)
+            leads = replace(found, alike=np.ones((3, 3), dtype=bool)).leads * 2 / (degree[a] + degree[b])
+            gain[a, b], gain[b, a] = leads[1, 0], leads[2, 0]
+        return gain
 
     @staticmethod
     def _fits_as_well(e: PairMatch, nodes: Component, turn: Similarity) -> bool:

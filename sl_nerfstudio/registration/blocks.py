@@ -2,8 +2,9 @@
 
 Frames are joined one after the other, so a join that was nearly open may have put a whole block of them where it fits
 less well. Every turn of the world that some pair says is tried on the block for which it gains most, by the log-odds of
-all pairs of frames across its border: which frames belong to it is a cut of a graph (Kernighan and Lin, 1970). Blocks
-move to where they are likelier. Then each frame alone is tried at all places that its pairs say, by all frames that
+all pairs of frames across its border: which frames belong to it is a cut of a graph (Kernighan and Lin, 1970). Where
+the object looks the same after a turn, all frames that face each other say it, registered or not. Blocks move to where
+they are likelier. Then each frame alone is tried at all places that its pairs say, by all frames that
 face it there: the pair that held it may have slipped. A block that is nearly as likely elsewhere is not decided, and
 stays apart.
 """
@@ -17,7 +18,7 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import LARGEST_BASELINE, MOST_AGAINST, Assembly, Elsewhere
+from sl_nerfstudio.registration.assembly import ADJUSTED_DEG, LARGEST_BASELINE, MOST_AGAINST, Assembly, Elsewhere
 from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_TURN_DEG, TONE_ODDS, PairMatch
 from sl_nerfstudio.registration.pose_graph import Component, optimise_at_places, optimise_known
 
@@ -25,7 +26,6 @@ MOST_TURNS = 48  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
 LEAST_GAIN = 1.0  # nats by which a block must fit better elsewhere to be moved
 LEAST_SIDE_DEG = 12.0  # between two sides of an object, or teeth of a gear; closer places are slides along a surface
-ADJUSTED_DEG = 6.0  # between two places, up to which the joint adjustment leads from one to the other
 STARTS = 24  # frames from which a block is grown
 
 
@@ -217,9 +217,10 @@ class BlockReview:
         self, turn: Similarity, column: Mapping[int, int], pairs: Sequence[tuple[PairMatch, Similarity, float | None]],
         ordered: Sequence[tuple[int, int, Similarity, float]],
     ) -> Turn:  # fmt: skip
-        surface, order = np.zeros((2, len(column), len(column)))
+        order = np.zeros((len(column), len(column)))
         inverse = turn.inverse()
         alike = self._assembly.looks_alike(self.nodes, turn)
+        surface = self._assembly.gains_among_alike(self.nodes, turn) if alike else np.zeros_like(order)
         for e, S, here in pairs:
             i, j = column[e.source], column[e.target]
             weight = 2 / (self._degree[e.source] + self._degree[e.target])  # see Assembly.compare
@@ -227,7 +228,7 @@ class BlockReview:
                 there = e.log_odds_at(way @ self.nodes[e.source])
                 if e.by_tone:
                     surface[moved, kept] += weight * TONE_ODDS * (float(there is not None) - float(here is not None))
-                elif not (alike and (here is None or there is None)):  # see Comparison
+                elif not alike:
                     before, after = (-MOST_AGAINST if odds is None else odds for odds in (here, there))
                     surface[moved, kept] += weight * (after - before)
         if self._prior is not None:
