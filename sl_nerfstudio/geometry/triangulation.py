@@ -106,6 +106,23 @@ def triangulate(
 # Epipolar geometry of a camera and a projector.
 
 
+def triangulate_pixels(
+    camera: Device,
+    projector: Device,
+    T_world_camera: Float64[ndarray, "4 4"],
+    T_world_projector: Float64[ndarray, "4 4"],
+    coords: Float[ndarray, "_h _w 2"],
+    row: Int64[ndarray, "n"],
+    column: Int64[ndarray, "n"],
+) -> Triangulation:
+    """The points that some decoded pixels of a frame see, by its map of projector coordinates."""
+    uv = torch.from_numpy(np.stack([column, row], -1) + 0.5)
+    uv_projector = torch.from_numpy(coords[row, column].astype(np.float64))
+    K_c, K_p = (Intrinsics.of(device, torch.float64) for device in (camera, projector))
+    T_c, T_p = torch.from_numpy(T_world_camera), torch.from_numpy(T_world_projector)
+    return triangulate(K_c, T_c, uv, K_p, T_p, uv_projector)
+
+
 def epipolar_residual(
     camera: Intrinsics,
     T_world_camera: Float[Tensor, "*#batch 4 4"],

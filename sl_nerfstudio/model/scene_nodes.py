@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, unproject
-from sl_nerfstudio.geometry.triangulation import Viewpoint, beside, far_enough, triangulate
+from sl_nerfstudio.geometry.triangulation import Viewpoint, beside, far_enough, triangulate_pixels
 
 SCENE_SCALE = 10.0
 """By which viewers enlarge the scene, as nerfstudio does (`VISER_NERFSTUDIO_SCALE_RATIO`)."""
@@ -175,14 +175,7 @@ def decoded_points(
     Pixels whose rays meet behind a device are left out.
     """
     row, column = _evenly(np.isfinite(coords).all(-1), most)
-    found = triangulate(
-        Intrinsics.of(camera, torch.float64),
-        torch.from_numpy(T_world_camera),
-        torch.from_numpy(np.stack([column, row], 1) + 0.5),
-        Intrinsics.of(projector, torch.float64),
-        torch.from_numpy(T_world_projector),
-        torch.from_numpy(coords[row, column].astype(np.float64)),
-    )
+    found = triangulate_pixels(camera, projector, T_world_camera, T_world_projector, coords, row, column)
     return found.p_world[(found.depth_camera > 0) & (found.depth_projector > 0)].numpy()
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.observations import observe, partners, place_anchors
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, Rig, linearise
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.geometry.devices import Device, project, unproject
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on, inverse, rotate, transform
 from sl_nerfstudio.geometry.numerics import (
     MAD_TO_SIGMA,
@@ -28,7 +28,7 @@ from sl_nerfstudio.geometry.numerics import (
     geman_mcclure_weight,
     nearest_distances,
 )
-from sl_nerfstudio.geometry.triangulation import Triangulation, closest_approach, triangulate, world_pixels
+from sl_nerfstudio.geometry.triangulation import Triangulation, closest_approach, triangulate_pixels, world_pixels
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan.types import PoseSigma, Scan
 
@@ -369,11 +369,8 @@ def triangulate_some(
     decoded = np.flatnonzero(np.isfinite(coords).all(-1))
     some = decoded[evenly_spaced(len(decoded), min(most, len(decoded)))]
     row, column = np.divmod(some, coords.shape[1])
-    uv = torch.from_numpy(np.stack([column, row], -1) + 0.5)
-    uv_projector = torch.from_numpy(coords[row, column].astype(np.float64))
-    K_c, K_p = (Intrinsics.of(device, torch.float64) for device in (camera, projector))
-    T_c, T_p = torch.from_numpy(T_world_camera), torch.from_numpy(T_world_projector)
-    return uv, triangulate(K_c, T_c, uv, K_p, T_p, uv_projector)
+    found = triangulate_pixels(camera, projector, T_world_camera, T_world_projector, coords, row, column)
+    return torch.from_numpy(np.stack([column, row], -1) + 0.5), found
 
 
 # Groups of frames: those that agree with each other, and weak places in a graph of pairs.
