@@ -20,9 +20,12 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, distort, unproject
+from sl_nerfstudio.parallel import threads
 from sl_nerfstudio.synthesis.devices import DevicePair
 
 _VARIANT = "llvm_ad_rgb"
+_OLDEST_LLVM = 16  # 15 ends the process on processors with AVX-512 ("Cannot select")
+_REMEDY = "    remedy: apt-get install libllvm19, or set DRJIT_LIBLLVM_PATH to a libLLVM.so of version 16 or later"
 _TEXELS = 2  # of the projector's ideal view, a pattern pixel
 _FINER = 1.25  # the camera's ideal view, times the photograph: resampling then costs little sharpness
 _LONGEST_PATH = 4  # edges from light to camera: two surfaces between the lamp's and the one that is seen
@@ -84,15 +87,15 @@ def mitsuba() -> Any:
             "mitsuba is not installed, and it renders these photographs\n"
             "    remedy: pip install 'sl-nerfstudio[render]'"
         )
-    mi = importlib.import_module("mitsuba")
-    mi.set_variant(_VARIANT)
+    mi, drjit = importlib.import_module("mitsuba"), importlib.import_module("drjit")
     try:
-        _ = (mi.Float(1.0) + mi.Float([1.0, 2.0])).numpy()
-    except RuntimeError as error:
-        raise UserError(
-            f"mitsuba finds no libLLVM, with which it compiles ({error})\n"
-            "    remedy: apt-get install libllvm15, or set DRJIT_LIBLLVM_PATH to a libLLVM.so"
-        ) from error
+        mi.set_variant(_VARIANT)
+        drjit.set_thread_count(threads())
+        version = drjit.detail.llvm_version()[0]
+    except ImportError as error:
+        raise UserError(f"mitsuba finds no libLLVM, with which it compiles: {error}\n{_REMEDY}") from error
+    if version < _OLDEST_LLVM:
+        raise UserError(f"mitsuba found libLLVM {version}, which cannot compile for all processors\n{_REMEDY}")
     return mi
 
 

@@ -2,6 +2,7 @@
 
 import importlib.util
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -116,4 +117,26 @@ def test_indirect_light_has_no_part_of_the_direct_one():
 def test_a_missing_renderer_is_named_with_its_remedy(monkeypatch):
     monkeypatch.setattr(rendering.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"mitsuba is not installed[\s\S]*pip install 'sl-nerfstudio\[render\]'"):
+        rendering.mitsuba()
+
+
+def _no_library(variant):
+    raise ImportError("could not be found")
+
+
+@pytest.mark.parametrize(
+    ("set_variant", "version", "said"),
+    [
+        (_no_library, (19, 1, 7), r"finds no libLLVM, with which it compiles: could not be found"),
+        (lambda variant: None, (15, 0, 7), r"found libLLVM 15, which cannot compile for all processors"),
+    ],
+)
+def test_a_compiler_that_is_missing_or_too_old_is_named_with_its_remedy(monkeypatch, set_variant, version, said):
+    modules = {
+        "mitsuba": SimpleNamespace(set_variant=set_variant),
+        "drjit": SimpleNamespace(set_thread_count=int, detail=SimpleNamespace(llvm_version=lambda: version)),
+    }
+    monkeypatch.setattr(rendering.importlib.util, "find_spec", modules.get)
+    monkeypatch.setattr(rendering.importlib, "import_module", modules.get)
+    with pytest.raises(UserError, match=said + r"\n.*remedy: apt-get install libllvm19"):
         rendering.mitsuba()
