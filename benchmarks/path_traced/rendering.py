@@ -28,9 +28,10 @@ _OLDEST_LLVM = 16  # 15 ends the process on processors with AVX-512 ("Cannot sel
 _REMEDY = "    remedy: apt-get install libllvm19, or set DRJIT_LIBLLVM_PATH to a libLLVM.so of version 16 or later"
 _TEXELS = 2  # of the projector's ideal view, a pattern pixel
 _FINER = 1.25  # the camera's ideal view, times the photograph: resampling then costs little sharpness
-_LONGEST_PATH = 4  # edges from light to camera: two surfaces between the lamp's and the one that is seen
+_LONGEST_PATH = 4  # edges from light to camera: at most two surfaces before the one that is seen
 _TOWARDS_ROOM_LAMP = np.array([0.5, 0.25, 1.0])
 _LAMP = 8.0  # irradiance by the projector where it is focused; only its ratio to the room's light shows
+_BRIGHTEST_INDIRECT = 0.5 * _LAMP / np.pi  # of a moment: single paths by way of highlights would be bright dots
 
 
 @dataclass(frozen=True)
@@ -165,8 +166,9 @@ class Studio:
             moment = seed * 2 * n + k
             total += self._rendered(self._lit, self._direct, quality.direct, moment)
             if quality.indirect:
-                total += self._rendered(self._lit, self._path, quality.indirect, moment + n)
-                total -= self._rendered(self._lit, self._direct, quality.indirect, moment + n)
+                traced = self._rendered(self._lit, self._path, quality.indirect, moment + n)
+                traced -= self._rendered(self._lit, self._direct, quality.indirect, moment + n)
+                total += np.minimum(traced, _BRIGHTEST_INDIRECT)
         if self._optics.room_light > 0:
             self._put(self._dim, {"camera.to_world": self._to_world(view.T_world_camera)})
             total += n * self._rendered(self._dim, self._path, quality.room, seed)
