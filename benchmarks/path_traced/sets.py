@@ -40,7 +40,8 @@ from sl_nerfstudio.synthesis.sdf import Scene
 class Camera:
     """A kind of camera, and how it is held."""
 
-    distance: float  # of both devices from the object, in sizes of the object
+    distance: float  # from the object, in sizes of the object
+    projector_distance: float  # of the projector with it: none has the field of view of a long lens
     distortion: tuple[float, float]  # k1, k2
     optics: Optics
     sensor: Sensor
@@ -48,15 +49,15 @@ class Camera:
 
 CAMERAS = {
     "phone": Camera(
-        2.4, (0.04, -0.03), Optics(camera_blur=1.0, projector_blur=5.0, shake=1.0, room_light=0.12),
+        2.4, 2.4, (0.04, -0.03), Optics(camera_blur=1.0, projector_blur=5.0, shake=1.0, room_light=0.12),
         Sensor(electrons=3000, read_noise=0.006, denoising=0.8, sharpening=0.7, quality=88),
     ),
     "machine": Camera(
-        4.0, (-0.12, 0.05), Optics(camera_blur=2.0, projector_blur=5.0, shake=0.3, room_light=0.05),
+        4.0, 4.0, (-0.12, 0.05), Optics(camera_blur=2.0, projector_blur=5.0, shake=0.3, room_light=0.05),
         Sensor(electrons=8000, read_noise=0.003, grey=True, linear=True, quality=95),
     ),
     "long": Camera(
-        8.0, (0.0, 0.0), Optics(camera_blur=4.0, projector_blur=6.0, shake=0.8, room_light=0.1),
+        8.0, 3.0, (0.0, 0.0), Optics(camera_blur=4.0, projector_blur=6.0, shake=0.8, room_light=0.1),
         Sensor(electrons=6000, read_noise=0.004, quality=92),
     ),
 }  # fmt: skip
@@ -121,7 +122,7 @@ def _render(one: PhotographSet, frames: int, resolution: int, quality: Quality, 
         bodies.append(body_of(surroundings, "matte", rng))
     far = camera.distance * scene.size
     studio = Studio(bodies, devices, pattern, camera.optics, scene.size, far)
-    focus = far * (1 + rng.uniform(-_PROJECTOR_FOCUS, _PROJECTOR_FOCUS))
+    focus = camera.projector_distance * scene.size * (1 + rng.uniform(-_PROJECTOR_FOCUS, _PROJECTOR_FOCUS))
     caster = RayCaster(scene, surroundings)
     names = _names(frames, one)
     (root / "images").mkdir(parents=True)
@@ -159,10 +160,11 @@ def _render(one: PhotographSet, frames: int, resolution: int, quality: Quality, 
 
 
 def _walk(one: PhotographSet, scene: Scene, camera: Camera, frames: int, rng: np.random.Generator) -> DevicePoses:
-    """Around the object, at the camera's distance: nearer or farther in the same directions."""
+    """Around the object: in the directions of `make_paths`, nearer or farther."""
     poses = make_paths(scene, frames, "half-turn" if one.order == "half" else "hand-held", rng)
     return DevicePoses(
-        *(_at(T, scene, camera.distance / DISTANCE) for T in (poses.T_world_camera, poses.T_world_projector))
+        _at(poses.T_world_camera, scene, camera.distance / DISTANCE),
+        _at(poses.T_world_projector, scene, camera.projector_distance / DISTANCE),
     )
 
 
