@@ -2,8 +2,8 @@
 
     python -m benchmarks.matching --captures FOLDER ... [--each 8] [--output FILE]
 
-Folders are those that `benchmarks.photographs` and `benchmarks.another_renderer` keep. What is decoded there is not
-decoded again; relative poses are those that sl-process finds. Every lit pixel counts, the surroundings' too.
+Folders are those of `benchmarks.photographs`. What is decoded there is not decoded again; relative poses are those that
+sl-process finds. Every lit pixel counts, the surroundings' too.
 """
 
 from dataclasses import dataclass, replace

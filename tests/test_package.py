@@ -58,7 +58,7 @@ def test_constraints_are_plain_pins_that_satisfy_the_declared_ranges():
     assert all(re.fullmatch(r"[A-Za-z0-9._-]+==[A-Za-z0-9.]+", line) for line in lines)
     assert len(pins) == len(lines)
     extras = PROJECT["optional-dependencies"]
-    for text in PROJECT["dependencies"] + extras["dev"] + extras["docs"]:
+    for text in PROJECT["dependencies"] + extras["dev"] + extras["docs"] + extras["render"]:
         requirement = Requirement(text)
         assert requirement.specifier.contains(pins[requirement.name]), text
 
@@ -72,7 +72,7 @@ def test_imported_packages_are_the_declared_dependencies():
     standard = sys.stdlib_module_names | {"sl_nerfstudio", "triton"}  # which comes with torch, if at all
     imported = {name.split(".")[0] for names in IMPORTS.values() for name in names} - standard
     extras = [text for name, texts in PROJECT["optional-dependencies"].items()
-              if name not in ("dev", "docs") for text in texts]  # fmt: skip
+              if name not in ("dev", "docs", "render") for text in texts]  # fmt: skip
     declared = {distribution_name(text) for text in PROJECT["dependencies"] + extras} - NOT_IMPORTED.keys()
     assert imported == {IMPORTED_AS.get(name, name) for name in declared}
 

@@ -17,20 +17,8 @@ import numpy as np
 import trimesh
 from numpy import ndarray
 
-from benchmarks.another_renderer.objects import (
-    ball,
-    block,
-    bracket,
-    drum,
-    housing,
-    joined,
-    meshed,
-    moved,
-    nut,
-    prism,
-    without,
-)  # fmt: skip
 from benchmarks.common.measuring import Rows, options
+from benchmarks.registration.solids import ball, block, drum, joined, meshed, moved, prism, without
 from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration
@@ -99,6 +87,34 @@ def mouse() -> trimesh.Trimesh:
 def brick() -> trimesh.Trimesh:
     """A block that is the same after half a turn about each of three axes."""
     return meshed(block((0, 0, 0), (100, 62, 40), 2), (60, 40, 30))
+
+
+def bracket() -> trimesh.Trimesh:
+    """An angle with holes and a rib."""
+    plates = joined(block((0, 0, -30), (100, 60, 10)), block((-45, 0, 5), (10, 60, 80)), blend=3)
+    rib = without(block((-25, 4, -8), (44, 8, 40)), moved(block((30, 0, 30), (90, 60, 60)), (-8, 0, 0), 0, -45))
+    holes = [drum((x, y, -30), r, 30) for x, y, r in ((5, -16, 7), (34, 14, 9), (36, -18, 5))]
+    return meshed(without(joined(plates, rib), *holes, drum((-45, -8, 20), 11, 30, axis=0)), (62, 42, 56))
+
+
+def nut() -> trimesh.Trimesh:
+    """Hexagonal, with a hole."""
+    return meshed(without(prism(6, 45, 38), drum((0, 0, 0), 26, 60), ball((0, 0, 52), 40)), (58, 58, 26))
+
+
+def housing() -> trimesh.Trimesh:
+    """A bearing block: bore, feet with holes, bosses of unequal height, a rib, an oil cup."""
+    body = joined(block((0, 0, -28), (116, 46, 16), 2), drum((0, 0, 4), 32, 40, axis=1), blend=6)
+    ribs = joined(block((30, 0, -10), (40, 7, 30), 1), block((-30, 6, -12), (36, 6, 24), 1))
+    bosses = joined(
+        drum((46, 12, -14), 9, 22), drum((-46, -10, -18), 8, 12), drum((-44, 12, -16), 6, 20), drum((8, 0, 38), 8, 24),
+        blend=2,
+    )  # fmt: skip
+    holes = [
+        drum((0, 0, 4), 19, 80, axis=1), drum((46, 12, -14), 4, 80), drum((-46, -10, -18), 4, 80),
+        drum((8, 0, 46), 4, 20),
+    ]  # fmt: skip
+    return meshed(without(joined(body, ribs, bosses, blend=2), *holes), (64, 34, 56))
 
 
 THINGS: dict[str, Callable[[], trimesh.Trimesh]] = {
