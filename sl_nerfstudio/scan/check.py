@@ -327,7 +327,7 @@ def _unit_problem(coords: Float32[ndarray, "h w 2"], stored: CoordinateFiles) ->
         )
     if stored.units == "pixels" and (high <= FULL + 1).all():
         parts = values / FULL * size
-        if _beyond(values, size, _OUTSIDE).mean() > _MANY_OUTSIDE and _beyond(parts, size, 0).mean() <= _MANY_OUTSIDE:
+        if _beyond(values, size, _OUTSIDE).mean() > _MANY_OUTSIDE and _beyond(parts, size, 0.0).mean() <= _MANY_OUTSIDE:
             share = 100 * float(_beyond(values, size, _OUTSIDE).mean())
             return Problem(
                 f"puts {share:.0f} % of the pixels outside the pattern ({span})",

@@ -225,7 +225,9 @@ def _page(path: Path) -> "Iterator[TiffPage]":
 
     try:
         with path.open("rb") as stream, TiffFile(stream) as file:
-            if len(file.pages) != 1:
+            if not len(file.pages):
+                raise ValueError("there is no image in it")
+            if len(file.pages) > 1:
                 raise FileError(
                     path, f"holds {len(file.pages)} images", "each row or channel was written as an image of its own",
                     f"write it with {_STORE}",
@@ -252,9 +254,6 @@ def _tiff_size(path: Path, page: "TiffPage") -> tuple[int, int]:
         raise FileError(
             path, f"has {channels} channel{'s'[: channels - 1]} instead of 2 or 3", cause, f"write it with {_STORE}"
         )
-    if kind not in (np.float32, np.uint16):
-        cause = "too few levels for coordinates" if kind in (np.uint8, np.float16) else "it was saved from another type"
-        raise FileError(path, f"holds {kind} instead of float32 or uint16", cause, f"write it with {_STORE}")
     if page.compression not in _LOSSLESS or page.photometric not in _PLAIN:
         raise FileError(
             path,
@@ -263,6 +262,9 @@ def _tiff_size(path: Path, page: "TiffPage") -> tuple[int, int]:
             "OpenCV writes floating-point TIFF in this way unless it is told otherwise",
             "write it with cv2.imwrite(file, array, [cv2.IMWRITE_TIFF_COMPRESSION, 1])",
         )
+    if kind not in (np.float32, np.uint16):
+        cause = "too few levels for coordinates" if kind in (np.uint8, np.float16) else "it was saved from another type"
+        raise FileError(path, f"holds {kind} instead of float32 or uint16", cause, f"write it with {_STORE}")
     if channels == 2 and (page.compression == _LZW or page.predictor == _FLOATING_PREDICTOR):
         raise FileError(
             path, "has two channels with a compression that is not read (LZW)", "the program's default",
