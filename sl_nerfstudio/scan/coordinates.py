@@ -1,5 +1,6 @@
 """The coordinates of a frame as files: an array, a pair of 16-bit images, or one TIFF with both; and what they mean."""
 
+import logging
 import math
 import struct
 import zipfile
@@ -126,6 +127,7 @@ _STORE = (
     'tifffile.imwrite(file, array, photometric="minisblack", planarconfig="contig") from a float32 or uint16 array '
     "of shape (H, W, 2)"
 )
+logging.getLogger("tifffile").addHandler(logging.NullHandler())  # what is wrong with a file is said here
 _LOSSLESS = (1, 5, 8, 32773, 32946)  # numbers of TIFF's compressions: none, LZW, Deflate, PackBits, Deflate
 _LZW, _FLOATING_PREDICTOR = 5, 3
 _PLAIN = (1, 2)  # numbers of TIFF's colour models: grey with black at 0, and RGB
@@ -232,7 +234,10 @@ def _page(path: Path) -> "Iterator[TiffPage]":
                     path, f"holds {len(file.pages)} images", "each row or channel was written as an image of its own",
                     f"write it with {_STORE}",
                 )  # fmt: skip
-            yield file.pages.first
+            page = file.pages.first
+            if not (page.dataoffsets and all(page.dataoffsets) and all(page.databytecounts)):
+                raise ValueError("a part of the image is not there")  # tifffile would put 0
+            yield page
     except FileError:
         raise
     except (*_TIFF_DAMAGE, TiffFileError) as error:

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 from numpy import ndarray
 from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, only_fault
 
@@ -251,6 +253,26 @@ def test_tiffs_that_hold_no_coordinates(tiffs, write, problem):
     fault = only_fault(tiffs)
     assert (fault.file, fault.frame) == (BOTH, NAME)
     assert problem in fault.problem and fault.remedy
+
+
+@settings(max_examples=200, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(data=st.data())
+@pytest.mark.parametrize("kind", [{}, {"compression": "zlib"}, {"tile": (16, 16)}])
+def test_a_damaged_header_is_refused_or_read(tmp_path_factory, capfd, kind, data):
+    """Whatever its bytes say, there is an array or a message, and no word of the library's own."""
+    path = tmp_path_factory.getbasetemp() / "damaged.tif"
+    tifffile.imwrite(path, GOOD, **PLANE, **kind)
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 3))):
+        content[data.draw(st.integers(0, 300))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content)
+    try:
+        found = CoordinateFiles((path,)).read()
+    except FileError as error:
+        assert error.problem and error.remedy
+    else:
+        assert found.dtype == np.float32 and found.shape[2] == 2
+    assert capfd.readouterr() == ("", "")
 
 
 def test_exr_is_refused_with_the_command_that_converts_it(tiffs):
