@@ -91,7 +91,8 @@ sl_neus_paper = MethodSpecification(
         rays=2024,
     ),
     description="The method of Furukawa, Nishihara and Kawasaki (2025), for comparison; three details differ: xyz as "
-    "input, a rounded ReLU, coordinates divided by the accumulated weight.",
+    "input, a rounded ReLU, coordinates divided by the accumulated weight. Poses move as "
+    "--pipeline.model.camera-optimizer.mode and --pipeline.model.projector-optimizer.mode say: {SE3,SO3xR3,off}.",
 )
 
 

@@ -125,6 +125,21 @@ def test_sl_check_writes_arrays_to_a_new_folder(pairs, tmp_path, capsys):
         check(CheckArguments(pairs, pairs))
 
 
+def test_of_a_training_run_no_copy_is_written(tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run/config.yml").write_text("{}")
+    with pytest.raises(UserError, match="is a training run, of which no copy is written"):
+        check(CheckArguments(tmp_path / "run", tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_faulty_scan_is_not_written(pairs, tmp_path):
+    (pairs / X).unlink()
+    with pytest.raises(UserError, match=r"coords/frame_00001_x\.png: is missing"):
+        check(CheckArguments(pairs, tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
+
+
 # ---- what is refused
 
 
