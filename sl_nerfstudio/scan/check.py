@@ -45,6 +45,7 @@ _MANY_EQUAL = 0.02  # share of the decoded pixels with one value; neighbours may
 _FEW = 20
 _FEWEST_NEIGHBOURS = 200
 _WRITE_NAN = "write NaN where a pixel was not decoded"
+_WRITE_ZERO = "write 0 in the images of x and y where a pixel was not decoded"  # in 16 bits there is no NaN
 _NOISE = 0.7  # of a typical distance from the median; a surface across 16 pixels has 0.25, independent values 1 to 1.5
 
 
@@ -308,6 +309,8 @@ def _check_coords(files: _Files, frame: PartialFrame, projector: Device | None) 
     problem = None if projector is None or not stored.are_images else _unit_problem(coords, stored)
     problems = list(coordinate_problems(coords, projector)) if problem is None else [problem]
     for problem in problems:
+        if problem.remedy == _WRITE_NAN and len(stored.paths) == 2:
+            problem = replace(problem, remedy=_WRITE_ZERO)
         files.add(problem, frame.coords_key)
     return None if problems else coords
 

@@ -212,6 +212,7 @@ def test_images_that_are_no_pair(pairs, spoil, path, problem):
         change(pairs, Y, spoil)
     fault = only_fault(pairs)
     assert (fault.file, fault.frame) == (path, NAME) and problem in fault.problem
+    assert "value" not in problem or fault.remedy == "write 0 in the images of x and y where a pixel was not decoded"
 
 
 def test_two_sizes_without_a_camera_to_compare_with(pairs):
