@@ -5,9 +5,9 @@
 For every scene and seed, one noisy scan is made and trained four times: by `sl-neus` with its defaults (`refined`),
 with the starting poses kept (`unrefined`), with the true poses given (`oracle`, about the best this field can do), and
 with the relative poses kept (`known-rig`). `--variants` selects others: one part of the method left out (`no-pattern`,
-`no-annealing`, `no-direct`, `no-warm-start`, `no-coarse-to-fine`), or poses refined by the rendering losses instead of
-the bundle adjustment (`by-gradient`, `independent`), at the paper's rate for poses, 1e-3 instead of 1e-4. Prints a
-table and writes benchmarks/results/accuracy.json.
+`no-annealing`, where the sharpness stays as it starts, `no-direct`, `no-warm-start`, `no-coarse-to-fine`), or poses
+refined by the rendering losses instead of the bundle adjustment (`by-gradient`, `independent`), at the paper's rate for
+poses, 1e-3 instead of 1e-4. Prints a table and writes benchmarks/results/accuracy.json.
 """
 
 from collections.abc import Iterator, Sequence

@@ -16,7 +16,7 @@ from sl_nerfstudio.dataparser.datamanager import SLDataManagerConfig
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.late_imports import end_imports
 from sl_nerfstudio.model.model import RECOMMENDED_STEPS, SLModelConfig, paper_model
-from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
+from sl_nerfstudio.model.optimisers import default_optimizers
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
 from sl_nerfstudio.model.run_files import quiet_nerfstudio
 from sl_nerfstudio.model.trainer import SLTrainerConfig, default_device
@@ -54,7 +54,7 @@ def _explain_other_versions(kind: type[BaseException], error: BaseException, tra
 sys.excepthook = _explain_other_versions
 
 
-def _trainer(method_name: str, model: SLModelConfig, rays: int, optimizers: dict[str, Any]) -> SLTrainerConfig:
+def _trainer(method_name: str, model: SLModelConfig, rays: int) -> SLTrainerConfig:
     """A run that trains, saves, prints where the result is, and returns; meanwhile evaluated on held-out pixels."""
     return SLTrainerConfig(
         method_name=method_name,
@@ -68,12 +68,8 @@ def _trainer(method_name: str, model: SLModelConfig, rays: int, optimizers: dict
         steps_per_eval_image=0,  # whole frames take seconds to minutes without a GPU: ns-eval renders them on request
         steps_per_eval_all_images=0,
         pipeline=SLPipelineConfig(datamanager=SLDataManagerConfig(train_num_rays_per_batch=rays), model=model),
-        optimizers=optimizers,
+        optimizers=default_optimizers(method_name),
     )
-
-
-def _group(optimizer: Any, scheduler: DecaySchedulerConfig) -> dict[str, Any]:
-    return {"optimizer": optimizer, "scheduler": scheduler}
 
 
 sl_neus = MethodSpecification(
@@ -81,12 +77,6 @@ sl_neus = MethodSpecification(
         "sl-neus",
         SLModelConfig(),
         rays=4096,
-        optimizers={
-            "table": _group(RowAdamOptimizerConfig(lr=1e-3), DecaySchedulerConfig(final=0.002)),
-            "mlp": _group(FusedAdamOptimizerConfig(lr=1e-3, eps=1e-15), DecaySchedulerConfig(final=0.002)),
-            "camera_opt": _group(FusedAdamOptimizerConfig(lr=1e-4, eps=1e-15), DecaySchedulerConfig(final=0.01)),
-            "projector_opt": _group(FusedAdamOptimizerConfig(lr=1e-4, eps=1e-15), DecaySchedulerConfig(final=0.01)),
-        },
     ),
     description="Surface and poses of a scan with a moving pattern projector; quick with or without a GPU. Usual: "
     "--data SCAN --output-dir DIR --timestamp NAME --max-num-iterations STEPS --pipeline.model.refine-poses "
@@ -94,26 +84,15 @@ sl_neus = MethodSpecification(
 )
 
 
-def _paper_group(lr: float) -> dict[str, Any]:
-    """Down to 5e-12 at step 8,000, as in the paper."""
-    decay = DecaySchedulerConfig(shape="exponential", final=5e-12 / lr, max_steps=8000)
-    return _group(FusedAdamOptimizerConfig(lr=lr, eps=1e-15), decay)
-
-
 sl_neus_paper = MethodSpecification(
     config=_trainer(
         "sl-neus-paper",
         paper_model(),
         rays=2024,
-        optimizers={
-            "table": _paper_group(5e-4),
-            "mlp": _paper_group(5e-4),
-            "camera_opt": _paper_group(1e-3),
-            "projector_opt": _paper_group(1e-3),
-        },
     ),
     description="The method of Furukawa, Nishihara and Kawasaki (2025), for comparison; three details differ: xyz as "
-    "input, a rounded ReLU, coordinates divided by the accumulated weight.",
+    "input, a rounded ReLU, coordinates divided by the accumulated weight. Poses move as "
+    "--pipeline.model.camera-optimizer.mode and --pipeline.model.projector-optimizer.mode say: {SE3,SO3xR3,off}.",
 )
 
 

@@ -7,15 +7,18 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 import torch
 import yaml
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.plugins.types import MethodSpecification
 from nerfstudio.scripts import train as ns_train
 
-from sl_nerfstudio.methods import sl_neus
+from sl_nerfstudio.methods import sl_neus, sl_neus_paper
+from sl_nerfstudio.model.optimisers import FusedAdamOptimizerConfig
+from sl_nerfstudio.model.poses import PoseMode, PoseOptimizerConfig
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from tests.dataparser.tiny_scan import TinyScan
 
@@ -96,6 +99,39 @@ def without_rays() -> Any:
 )
 def test_bad_settings_do_not_start(scan, refused, settings, expected) -> None:
     assert expected in refused(scan, **settings)
+
+
+def of_poses(method: MethodSpecification, rate: float | None = None, **model: Any) -> dict[str, Any]:
+    """A method's settings with other ones of its model, and another learning rate of the cameras."""
+    config = copy.deepcopy(method.config)
+    for name, value in model.items():
+        setattr(config.pipeline.model, name, value)
+    if rate is not None:
+        config.optimizers["camera_opt"]["optimizer"] = FusedAdamOptimizerConfig(lr=rate, eps=1e-15)
+    return {name: getattr(config, name) for name in ("method_name", "pipeline", "optimizers")}
+
+
+MODE, CAMERA = "--pipeline.model.{}-optimizer.mode {}", "--optimizers.camera-opt"
+SE3, SO3XR3, OFF = (PoseOptimizerConfig(mode) for mode in get_args(PoseMode)[::-1])
+OWN_FLAGS = [
+    (of_poses(sl_neus, camera_optimizer=SE3, projector_optimizer=OFF, rate=1e-3),
+     [MODE.format("camera", "SE3"), MODE.format("projector", "off"), CAMERA, "pose-method adjust"]),
+    (of_poses(sl_neus, rate=1e-3), [CAMERA, "pose-method adjust"]),
+    (of_poses(sl_neus_paper, camera_optimizer=OFF, rate=1e-2), [CAMERA, "camera-optimizer.mode off"]),
+    (of_poses(sl_neus_paper, refine_poses="known-rig", projector_optimizer=SO3XR3),
+     [MODE.format("projector", "SO3xR3"), "refine-poses known-rig"]),
+    (of_poses(sl_neus_paper, refine_poses="off", camera_optimizer=SE3),
+     [MODE.format("camera", "SE3"), "refine-poses off"]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("settings", "expected"), OWN_FLAGS)
+def test_optimisers_of_poses_that_no_step_would_move(scan, refused, settings, expected) -> None:
+    """One message with all such flags."""
+    message = refused(scan, **settings)
+    named, cause = message.split(": no step of the training would move these poses\n")
+    assert named == "error: " + ", ".join(flag for flag in expected if flag.startswith("--"))
+    assert expected[-1] in cause.splitlines()[0] and "remedy: leave these flags out" in cause
 
 
 def test_a_truncated_checkpoint(scan, tmp_path, refused) -> None:

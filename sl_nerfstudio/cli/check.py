@@ -64,23 +64,42 @@ class CheckArguments:
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="DIR")]
     """the scan folder, which holds transforms.json; or a run's folder or its config.yml"""
+    output: Path | None = None
+    """if there are no faults, write the scan to this new folder, with coordinates in images as .npz in pattern pixels;
+    everything else stays as it is"""
 
 
 def main() -> None:
     """Entry point of `sl-check`."""
-    run(lambda: check(parse(CheckArguments, "sl-check").folder))
+    run(lambda: check(parse(CheckArguments, "sl-check")))
 
 
-def check(folder: Path) -> None:
+def check(arguments: CheckArguments) -> None:
     """Do what the command line asks for. Raises UserError with everything that is wrong."""
+    folder, output = arguments.folder, arguments.output
     require_paths({"DIR": (folder, SCAN)})
+    if output is not None:
+        _require_new(output, folder)
     with phase("check"):
-        said = check_run_folder(folder) if is_run(folder) else check_scan_folder(folder)
+        said = check_run_folder(folder) if is_run(folder) else check_scan_folder(folder, output)
     sys.stdout.write(said)
 
 
-def check_scan_folder(folder: Path) -> str:
-    """What the scan is, and how its frames agree. Raises ScanError with everything that is wrong."""
+def _require_new(output: Path, folder: Path) -> None:
+    """Before anything slow. Raises UserError if the output cannot be written, or `folder` is no scan."""
+    from sl_nerfstudio.errors import UserError
+    from sl_nerfstudio.storage import NewFolder
+
+    if is_run(folder):
+        raise UserError(
+            f"--output {output}: {folder} is a training run, of which no copy is written\n"
+            "    cause:  --output writes scans\n    remedy: leave --output out, or give the scan folder"
+        )
+    NewFolder(output).close(complete=False)
+
+
+def check_scan_folder(folder: Path, output: Path | None = None) -> str:
+    """What the scan is, and how its frames agree; then written to `output`. Raises ScanError for all that is wrong."""
     from sl_nerfstudio.errors import ScanError
     from sl_nerfstudio.scan.check import check_folder
 
@@ -95,6 +114,11 @@ def check_scan_folder(folder: Path) -> str:
 
             cross = compare_scan_frames(scan, scan.poses, [frame.pose_sigma for frame in scan.frames])
             said = agreement(result, cross, shared_surface_of_scan(scan).decoded, moving_share(scan))
+        if output is not None:
+            from sl_nerfstudio.scan.write import write_copy
+
+            write_copy(scan, output)
+            said += f"  written             {output}, with coordinates as .npz\n"
     return summary(result) + said
 
 

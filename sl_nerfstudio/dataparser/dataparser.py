@@ -80,7 +80,7 @@ def scan_fingerprint(scan: Scan) -> str:
     Neither the folder's place nor the times of its files have a part in it. Raises UserError for unreadable files.
     """
     whole = hashlib.sha256()
-    paths = [path for frame in scan.frames for path in (frame.coords_path, frame.mask_path) if path is not None]
+    paths = [path for frame in scan.frames for path in (*frame.coords_paths, frame.mask_path) if path is not None]
     for path in (scan.root / TRANSFORMS, *paths):
         whole.update(_file_hash(path))
     return whole.hexdigest()

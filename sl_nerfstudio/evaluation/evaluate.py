@@ -48,8 +48,8 @@ from sl_nerfstudio.scan import (
     read_scan,
     read_unplaced,
 )
+from sl_nerfstudio.scan.coordinates import ARRAY_DAMAGE
 from sl_nerfstudio.scan.document import TRANSFORMS, check_file, read_document
-from sl_nerfstudio.scan.images import ARRAY_DAMAGE
 from sl_nerfstudio.scan.types import UNITS
 
 # Distances between a reconstructed surface and the truth.

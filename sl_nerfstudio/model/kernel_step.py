@@ -41,7 +41,7 @@ def compile_kernels(model: SLModel, sampler: SLPixelSampler) -> None:
 
 def device_poses(poses: PoseParameters) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
     """`T_scene_camera` and `T_scene_projector` of all frames in float32, differentiable by the increments."""
-    if not poses.camera_step.requires_grad:
+    if not poses.camera_step.requires_grad or poses.modes != ("SE3", "SE3"):  # for which there is no kernel
         now = poses.transforms()
         return now.T_scene_camera, now.T_scene_projector
     by = poses.projector_moves_by

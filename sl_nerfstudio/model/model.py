@@ -37,7 +37,7 @@ from sl_nerfstudio.model.outputs import (
     seen_by_rays,
 )
 from sl_nerfstudio.model.pose_refinement import PriorConfig, adjust_scan, scene_rig, sigmas_in_scan_units
-from sl_nerfstudio.model.poses import FrameTransforms, PoseParameters, ProjectorMoves
+from sl_nerfstudio.model.poses import NOT_STATED, FrameTransforms, PoseOptimizerConfig, PoseParameters, ProjectorMoves
 from sl_nerfstudio.parallel import one_torch_thread
 from sl_nerfstudio.rendering.direct_losses import (
     DecodingNoise,
@@ -74,6 +74,10 @@ class SLModelConfig(ModelConfig):
     pose_method: Literal["adjust", "render", "render-independently"] = "adjust"
     """How poses are refined: `adjust` (bundle adjustment before the first step), `render` (only the rendering losses),
     `render-independently` (the same, with each device independent of the others)."""
+    camera_optimizer: PoseOptimizerConfig = NOT_STATED
+    """How the rendering losses move the cameras, if `pose_method` lets them."""
+    projector_optimizer: PoseOptimizerConfig = NOT_STATED
+    """The same for the projectors."""
     refine_intrinsics: bool = False
     """If the captures contradict focal lengths and principal points, change these before training, provided that
     held-out pixels then agree better; the scan folder is not changed."""
@@ -123,9 +127,21 @@ class SLModelConfig(ModelConfig):
         return self.refine_poses != "off" and self.pose_method == "adjust"
 
     @property
+    def free_to_render(self) -> tuple[bool, bool]:
+        """Whether rendering losses may move cameras, and projectors, if their optimisers are not off."""
+        may = self.refine_poses != "off" and self.pose_method != "adjust"
+        return may, may and self.refine_poses not in ("known-rig", "static-projector")
+
+    @property
+    def moved_by_rendering(self) -> tuple[bool, bool]:
+        """Whether the rendering losses move cameras, and whether they move projectors."""
+        camera, projector = self.free_to_render
+        return camera and self.camera_optimizer.used != "off", projector and self.projector_optimizer.used != "off"
+
+    @property
     def renders_poses(self) -> bool:
         """Whether the rendering losses move poses."""
-        return self.refine_poses != "off" and self.pose_method != "adjust"
+        return any(self.moved_by_rendering)
 
 
 def paper_model() -> SLModelConfig:
@@ -335,9 +351,7 @@ class SLModel(Model):
     @property
     def has_kernels(self) -> bool:
         """Whether there are kernels for a whole step: not for triangulated points from which poses learn."""
-        poses = self.device_poses
-        moves = poses.camera_step.requires_grad or poses.projector_step.requires_grad
-        return self.field.backend == "triton" and not (moves and self.config.losses.direct)
+        return self.field.backend == "triton" and not (self.device_poses.move and self.config.losses.direct)
 
     def _renders(self, step: int) -> bool:
         return step >= self.config.warm_start * self.config.schedule_iterations
@@ -471,11 +485,12 @@ def pose_parameters(
 ) -> PoseParameters:
     """The parameters for what is free (`refine_poses`) and how it is refined (`pose_method`)."""
     free, independent = config.refine_poses, config.pose_method == "render-independently"
+    modes = config.camera_optimizer.used, config.projector_optimizer.used
     moves: ProjectorMoves = "relative pose"
     if free == "static-projector":
         moves = "nothing"
     elif independent and free not in ("known-rig", "rigid-rig"):
-        moves = "own pose"
+        moves = "nothing" if modes[1] == "off" else "own pose"
     return PoseParameters(
         T_scene_camera,
         T_scene_projector,
@@ -484,6 +499,7 @@ def pose_parameters(
         shared_projector=free == "rigid-rig",
         about_scene=free == "static-projector" or not independent,
         projector_moves_by=moves,
+        modes=modes,
     )
 
 

@@ -96,3 +96,32 @@ class DecayScheduler(Scheduler):
         if c.max_steps is None:
             raise ValueError("DecaySchedulerConfig.max_steps is not set; SLTrainerConfig sets it before training")
         return LambdaLR(optimizer, LearningRate(c.shape, c.final, c.max_steps))
+
+
+# The optimisers of each method. Their names are those of nerfstudio's flags: camera_opt is --optimizers.camera-opt.
+
+POSE_GROUPS = ("camera_opt", "projector_opt")
+
+
+def default_optimizers(method: str) -> dict[str, Any]:
+    """Optimisers and decays of the parameters of `sl-neus` or `sl-neus-paper`, by group."""
+    if method == "sl-neus-paper":
+        rates = {"table": 5e-4, "mlp": 5e-4, **dict.fromkeys(POSE_GROUPS, 1e-3)}
+        return {name: _exponential(rate) for name, rate in rates.items()}
+    return {
+        "table": {"optimizer": RowAdamOptimizerConfig(lr=1e-3), "scheduler": DecaySchedulerConfig(final=0.002)},
+        "mlp": _cosine(1e-3, final=0.002),
+        **{name: _cosine(1e-4, final=0.01) for name in POSE_GROUPS},
+    }
+
+
+def _cosine(rate: float, final: float) -> dict[str, Any]:
+    optimizer = FusedAdamOptimizerConfig(lr=rate, eps=1e-15)
+    return {"optimizer": optimizer, "scheduler": DecaySchedulerConfig(final=final)}
+
+
+def _exponential(rate: float) -> dict[str, Any]:
+    """Down to 5e-12 at step 8,000, as in the paper."""
+    optimizer = FusedAdamOptimizerConfig(lr=rate, eps=1e-15)
+    decay = DecaySchedulerConfig(shape="exponential", final=5e-12 / rate, max_steps=8000)
+    return {"optimizer": optimizer, "scheduler": decay}

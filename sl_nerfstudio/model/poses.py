@@ -13,9 +13,35 @@ from torch import Tensor, nn
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance, as_stored, stored_columns
 from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, SelfCalibration
-from sl_nerfstudio.geometry.lie import exp_se3, inverse
+from sl_nerfstudio.geometry.lie import exp_se3, exp_so3, inverse, pose
 
+PoseMode = Literal["off", "SO3xR3", "SE3"]
 ProjectorMoves = Literal["nothing", "relative pose", "own pose"]
+
+
+@dataclass(frozen=True)
+class PoseOptimizerConfig:
+    """How the rendering losses move the poses of one kind of device, under the names that nerfstudio has for it."""
+
+    mode: PoseMode | None = None
+    """Six numbers move each pose: `SE3` (the exponential of a twist), `SO3xR3` (a rotation vector, and a translation
+    apart from it) or `off` (poses stay as they are); left out: `SE3` where the losses move poses."""
+
+    @property
+    def used(self) -> PoseMode:
+        """The mode where the losses move poses."""
+        return self.mode or "SE3"
+
+
+NOT_STATED = PoseOptimizerConfig()
+
+
+def increments(mode: PoseMode, steps: Float[Tensor, "n 6"]) -> Float[Tensor, "n 4 4"]:
+    """The rigid motions of steps (translation, rotation vector in radian); none for `off`."""
+    if mode == "SE3":
+        return exp_se3(steps)
+    moves = steps if mode == "SO3xR3" else torch.zeros_like(steps)
+    return pose(exp_so3(moves[:, 3:]), moves[:, :3])
 
 
 @dataclass(frozen=True)
@@ -50,14 +76,15 @@ class PoseParameters(nn.Module):
         shared_projector: bool = False,
         about_scene: bool = True,
         projector_moves_by: ProjectorMoves = "relative pose",
+        modes: tuple[PoseMode, PoseMode] = ("SE3", "SE3"),
     ) -> None:
-        """Parameters that the losses move if `refine`.
+        """Parameters that the losses move if `refine`; `modes` of cameras and projectors.
 
         Cameras turn about the scene's centre, or each about its own. `projector_moves_by` is what the projector's
         increment changes, and `shared_projector` makes it one increment for all frames.
         """
         super().__init__()
-        self.about_scene, self.projector_moves_by = about_scene, projector_moves_by
+        self.about_scene, self.projector_moves_by, self.modes = about_scene, projector_moves_by, modes
         for name, T in (("camera", T_scene_camera), ("projector", T_scene_projector)):
             self.register_buffer(f"start_{name}", T.double().clone())
             self.register_buffer(f"base_{name}", T.double().clone())
@@ -73,10 +100,9 @@ class PoseParameters(nn.Module):
         joint = torch.full((size, stored_columns(size)), float("nan"), dtype=torch.float64)
         self.register_buffer("joint_factor", joint)
         self.register_buffer("unplaced", torch.zeros(n, dtype=torch.bool))  # frames that disagree with the others
-        self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine)
-        self.projector_step = nn.Parameter(
-            torch.zeros(1 if shared_projector else n, 6), requires_grad=refine and refine_projector
-        )
+        self.camera_step = nn.Parameter(torch.zeros(n, 6), requires_grad=refine and modes[0] != "off")
+        moves = refine and refine_projector and modes[1] != "off"
+        self.projector_step = nn.Parameter(torch.zeros(1 if shared_projector else n, 6), requires_grad=moves)
         self._fixed: FrameTransforms | None = None
         self.register_load_state_dict_post_hook(_forget)
 
@@ -121,18 +147,25 @@ class PoseParameters(nn.Module):
 
     def forward(self) -> tuple[Float[Tensor, "frames 4 4"], Float[Tensor, "frames 4 4"]]:
         """`T_scene_camera` and `T_scene_projector` of all frames, float64, differentiable."""
-        step = exp_se3(self.camera_step.double())
-        camera = step @ self.base_camera if self.about_scene else self.base_camera @ step
-        if self.projector_moves_by == "nothing":
+        camera = self.base_camera
+        if self.modes[0] != "off":
+            step = increments(self.modes[0], self.camera_step.double())
+            camera = step @ self.base_camera if self.about_scene else self.base_camera @ step
+        if self.projector_moves_by == "nothing" or self.modes == ("off", "off"):
             return camera, self.base_projector
-        step = exp_se3(self.projector_step.double())
+        step = increments(self.modes[1], self.projector_step.double())
         if self.projector_moves_by == "own pose":
             return camera, self.base_projector @ step
         return camera, camera @ (step @ inverse(self.base_camera) @ self.base_projector)
 
+    @property
+    def move(self) -> bool:
+        """Whether the losses move any of them."""
+        return self.camera_step.requires_grad or self.projector_step.requires_grad
+
     def transforms(self) -> FrameTransforms:
         """The current poses as rays need them, differentiable; computed once if no losses move the poses."""
-        if self.camera_step.requires_grad or self.projector_step.requires_grad:
+        if self.move:
             return self._transforms()
         if self._fixed is None:
             with torch.inference_mode(False), torch.no_grad():

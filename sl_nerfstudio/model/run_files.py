@@ -50,6 +50,9 @@ def decisive_settings(config: Any) -> dict[str, Any]:
     The number of steps is left out, too: training can go on.
     """
     model = {name: value for name, value in plain(config.pipeline.model).items() if name not in _WITHOUT_EFFECT}
+    for name in ("camera_optimizer", "projector_optimizer"):  # left out, they say what runs before them did
+        if model[name] == {"mode": None}:
+            del model[name]
     return {
         "method_name": config.method_name,
         "seed": config.machine.seed,

@@ -3,6 +3,7 @@
 import os
 import shlex
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -22,7 +23,7 @@ from sl_nerfstudio.model import loop
 from sl_nerfstudio.model.loop import SLTrainer
 from sl_nerfstudio.model.messages import refine_intrinsics, refined_intrinsics_message
 from sl_nerfstudio.model.model import SLModelConfig
-from sl_nerfstudio.model.optimisers import DecaySchedulerConfig
+from sl_nerfstudio.model.optimisers import POSE_GROUPS, DecaySchedulerConfig, default_optimizers
 from sl_nerfstudio.model.pipeline import SLPipelineConfig
 from sl_nerfstudio.model.run_files import (
     CONFIG,
@@ -145,9 +146,17 @@ class SLTrainerConfig(TrainerConfig):
                 raise UserError(f"{flag} {value}: at least 1 is needed")
         if not 0 <= seed < 2**32:
             raise UserError(f"--machine.seed {seed}: give a number from 0 to {2**32 - 1}")
+        _require_pose_flags(self.pipeline.model, self._changed_pose_groups())  # type: ignore[arg-type]
         for flag, name in (("--timestamp", self.timestamp), ("--experiment-name", self.experiment_name)):
             if name is not None and (not name.strip() or Path(name).is_absolute() or ".." in Path(name).parts):
                 raise UserError(f"{flag} {name!r}: is not the name of a folder inside --output-dir")
+
+    def _changed_pose_groups(self) -> list[str]:
+        """Optimisers of poses that are not the method's own; none in a config.yml, which was checked before."""
+        if self.last_step is not None:
+            return []
+        usual, own = default_optimizers(self.method_name or ""), self.optimizers
+        return [name for name in POSE_GROUPS if name in own and own[name]["optimizer"] != usual[name]["optimizer"]]
 
     def print_to_terminal(self) -> None:
         """Print all settings on request; config.yml in the run's folder holds them in any case."""
@@ -231,6 +240,29 @@ class SLTrainerConfig(TrainerConfig):
         if data == Path():
             raise UserError(f"no scan given. Add --data FOLDER: ns-train {self.method_name} --data FOLDER")
         return scan_root(data)
+
+
+def _require_pose_flags(model: SLModelConfig, changed: Sequence[str]) -> None:
+    """Raise UserError for settings of poses that no step moves; `changed`: groups of optimisers that were set."""
+    optimizers, flags = (model.camera_optimizer, model.projector_optimizer), []
+    for device, optimizer, free in zip(("camera", "projector"), optimizers, model.free_to_render, strict=True):
+        if optimizer.mode is not None and not free:
+            flags.append(f"--pipeline.model.{device}-optimizer.mode {optimizer.mode}")
+    for group, moves in zip(POSE_GROUPS, model.moved_by_rendering, strict=True):
+        if group in changed and not moves:
+            flags.append(f"--optimizers.{group.replace('_', '-')}")
+    if not flags:
+        return
+    settings = [f"pose-method {model.pose_method}", f"refine-poses {model.refine_poses}"]
+    for device, optimizer in zip(("camera", "projector"), optimizers, strict=True):
+        settings += [f"{device}-optimizer.mode off"] if optimizer.mode == "off" else []
+    raise UserError(
+        f"{', '.join(flags)}: no step of the training would move these poses\n"
+        f"    cause:  {', '.join(f'--pipeline.model.{setting}' for setting in settings)}; poses are adjusted before "
+        "the first step, or stay as they are, unless the rendering losses may move them\n"
+        "    remedy: leave these flags out; --pipeline.model.refine-poses off keeps all poses; "
+        "--pipeline.model.pose-method render-independently lets rendering move them, as in sl-neus-paper"
+    )
 
 
 def _intrinsics_change(

@@ -21,8 +21,9 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.processing.captures import CapturedFrame
 from sl_nerfstudio.registration.surfaces import FrameCloud
 from sl_nerfstudio.relative_pose.estimation import Degeneracy, RelativePose
+from sl_nerfstudio.scan.coordinates import ARRAY_DAMAGE
 from sl_nerfstudio.scan.document import read_bytes
-from sl_nerfstudio.scan.images import ARRAY_DAMAGE, Pixels
+from sl_nerfstudio.scan.images import Pixels
 from sl_nerfstudio.scan.write import encode_json
 from sl_nerfstudio.storage import encode_npz, in_file, largest_in_memory, read_checked, write_atomic, write_checked
 

@@ -12,7 +12,6 @@ from scipy.ndimage import find_objects, gaussian_filter
 
 from sl_nerfstudio.console import track
 from sl_nerfstudio.decoding.decoder import drop_small_regions
-from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.numerics import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import pixel_centres, pixel_rays, world_pixels
@@ -33,11 +32,9 @@ from sl_nerfstudio.redecoding.measure import (
     measure,
 )
 from sl_nerfstudio.runs.run import TrainedRun
-from sl_nerfstudio.scan import Scan
-from sl_nerfstudio.scan.document import TRANSFORMS, Record, read_bytes, read_document
-from sl_nerfstudio.scan.images import encode_coords
-from sl_nerfstudio.scan.read import FRAME_FILES
-from sl_nerfstudio.scan.write import encode_json
+from sl_nerfstudio.scan.coordinates import encode_coords
+from sl_nerfstudio.scan.document import TRANSFORMS, read_document
+from sl_nerfstudio.scan.write import copy_others, encode_json, put_coords
 from sl_nerfstudio.storage import NewFolder
 
 # What a surface and the poses of a frame say that each pixel of the frame sees of the pattern.
@@ -399,35 +396,11 @@ def redecode_run(run: TrainedRun, output: Path, resolution: int = 256) -> Redeco
             coords, found = redecode_frame(
                 frame.name, frame.read_pattern(), mask, frame.read_coords(), predicted, pattern, ambiguity
             )
-            folder.write(_put_coords(document, k, frame.name), encode_coords(coords))
+            folder.write(put_coords(document, k, frame.name), encode_coords(coords))
             facts.append(found)
-        _copy_others(folder, scan, document)
+        copy_others(folder, scan, document, (RECORD,))
         result = Redecoded(tuple(facts))
         record = {"share_before": result.share_before, "share_after": result.share_after}
         folder.write(RECORD, encode_json({**record, "frames": [dataclasses.asdict(frame) for frame in result.frames]}))
         folder.write(TRANSFORMS, encode_json(document), last=True)
     return result
-
-
-def _put_coords(document: Record, index: int, name: str) -> str:
-    """The path of a frame's new coordinates, after it was put into the document."""
-    frames = document.get("frames")
-    if not isinstance(frames, list) or len(frames) <= index or Path(frames[index]["file_path"]).stem != name:
-        raise UserError(
-            f"{TRANSFORMS}: has other frames than when it was read\n"
-            "    cause:  the file was edited meanwhile\n    remedy: try again"
-        )
-    frames[index]["sl_coords_path"] = f"coords/{name}.npz"
-    return frames[index]["sl_coords_path"]
-
-
-def _copy_others(folder: NewFolder, scan: Scan, document: Record) -> None:
-    """Every file that transforms.json names, except coordinates; the truth; and descriptions (JSON) beside them."""
-    keys = [key for key in FRAME_FILES if key != "sl_coords_path"]
-    named = [document["projector"]["pattern_path"]]
-    named += [record[key] for record in document["frames"] for key in keys if record.get(key)]
-    truth = sorted(path for path in (scan.root / "ground_truth").rglob("*") if path.is_file())
-    beside = sorted(path for path in scan.root.glob("*.json") if path.name not in (TRANSFORMS, RECORD))
-    others = [path.relative_to(scan.root).as_posix() for path in (*truth, *beside)]
-    for path in track(dict.fromkeys([*named, *others]), "copying"):
-        folder.write(path, read_bytes(scan.root / path))

@@ -52,7 +52,7 @@ class AnnealingConfig:
 
     kappa: KappaGrowth = "geometric"
     """Sharpness of the surface: `geometric` growth over the run, `linear` with the steps (the paper's), or `constant`
-    at its end value."""
+    at its start value (the paper without annealing)."""
     coarse_to_fine: bool = True
     """Fade in the grid's finer levels one after the other; off: use all levels from the first step."""
 
@@ -60,7 +60,7 @@ class AnnealingConfig:
 def kappa_at(growth: KappaGrowth, step: int, total: int) -> float:
     """Sharpness at a step, per scene unit."""
     if growth == "constant":
-        return KAPPA_END
+        return KAPPA_START
     if growth == "linear":
         return min(KAPPA_START + _KAPPA_PER_STEP * step, _LINEAR_KAPPA_END)
     share = min(step / max(total, 1), 1.0)

@@ -54,8 +54,8 @@ from sl_nerfstudio.runs.cameras import (
 from sl_nerfstudio.runs.export_settings import BLENDER_FILE, COLMAP_FOLDER, ExportSettings, Standing
 from sl_nerfstudio.runs.run import TrainedModel, TrainedRun
 from sl_nerfstudio.scan import FileError, PoseSigma, Scan, write_transforms
+from sl_nerfstudio.scan.coordinates import ARRAY_DAMAGE
 from sl_nerfstudio.scan.document import TRANSFORMS
-from sl_nerfstudio.scan.images import ARRAY_DAMAGE
 from sl_nerfstudio.scan.types import UNITS
 from sl_nerfstudio.scan.write import encode_json, sigma_fields
 from sl_nerfstudio.storage import encode_npz, write_atomic

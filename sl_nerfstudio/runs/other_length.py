@@ -42,7 +42,10 @@ def training_key(scan: Scan) -> str:
         sigma = () if frame.pose_sigma is None else tuple(vars(frame.pose_sigma).values())
         numbers = np.concatenate([frame.T_world_camera.ravel(), frame.T_world_projector.ravel(), sigma])
         whole.update(f"{frame.name} {frame.camera!r} {_rounded(numbers).tolist()}".encode())
-        paths += [path for path in (frame.coords_path, frame.mask_path, frame.pattern_path) if path is not None]
+        coords = frame.coords_files
+        if coords is not None and coords.are_images:  # an array says all by itself
+            whole.update(f"{coords.units} {coords.pattern}".encode())
+        paths += [path for path in (*frame.coords_paths, frame.mask_path, frame.pattern_path) if path is not None]
     for path in paths:
         whole.update(hashlib.sha256(path.read_bytes()).digest())
     return whole.hexdigest()

@@ -33,6 +33,7 @@ from sl_nerfstudio.scan import read_scan
 
 _MOST_BYTES = 1 << 20  # a configuration has some ten thousand
 _PYTHON = "tag:yaml.org,2002:python/"
+_LATER = ("camera_optimizer", "projector_optimizer")  # settings that runs before them lack: their defaults say the same
 
 
 def read_config(path: Path) -> SLTrainerConfig:
@@ -160,7 +161,7 @@ class _ConfigLoader(yaml.SafeLoader):
                 raise _NotExpected(key, f"{kind.__name__} has no setting {key.value!r}", earlier=_is_ours(name))
             if not _fits(values[key.value], hints[key.value]):
                 raise _NotExpected(item, f"{values[key.value]!r:.100} is no value for {kind.__name__}.{key.value}")
-        missing = [name for name in names if name not in values]
+        missing = [name for name in names if name not in values and name not in _LATER]
         if missing:
             raise _NotExpected(node, f"{kind.__name__} lacks the setting {missing[0]!r}")
         made = object.__new__(kind)

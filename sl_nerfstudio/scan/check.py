@@ -28,8 +28,9 @@ from sl_nerfstudio.scan.check_images import (
     pattern_shift,
     shift_problems,
 )
+from sl_nerfstudio.scan.coordinates import COORDS_KEYS, FULL, UNITS_KEY, CoordinateFiles
 from sl_nerfstudio.scan.document import TRANSFORMS, Faults, FileError, Problem
-from sl_nerfstudio.scan.images import as_grey, read_coords, read_image
+from sl_nerfstudio.scan.images import as_grey, read_image
 from sl_nerfstudio.scan.read import PartialFrame, PartialScan, check_headers, read_partial_scan, relative
 from sl_nerfstudio.scan.types import UNITS, Scan, measured_length
 from sl_nerfstudio.scan.write import GROUND_TRUTH, read_ground_truth
@@ -44,6 +45,7 @@ _MANY_EQUAL = 0.02  # share of the decoded pixels with one value; neighbours may
 _FEW = 20
 _FEWEST_NEIGHBOURS = 200
 _WRITE_NAN = "write NaN where a pixel was not decoded"
+_WRITE_ZERO = "write 0 in the images of x and y where a pixel was not decoded"  # in 16 bits there is no NaN
 _NOISE = 0.7  # of a typical distance from the median; a surface across 16 pixels has 0.25, independent values 1 to 1.5
 
 
@@ -226,7 +228,7 @@ def check_content(
 ) -> FrameContent:
     """Decode all files of a frame that are in `good`, and report what is wrong with their pixels."""
     files = _Files({key: path for key, path in frame.paths.items() if path in good}, partial.root, frame.name, faults)
-    coords, mask = _check_coords(files, partial.projector), _check_mask(files)
+    coords, mask = _check_coords(files, frame, partial.projector), _check_mask(files)
     decoded = None if coords is None else np.isfinite(coords[..., 0])  # and so is the other, or it would be a fault
     where = decoded if mask is None else mask
     both = decoded if decoded is None or mask is None else decoded & mask
@@ -295,12 +297,47 @@ def duplicate_problems(contents: list[FrameContent]) -> Iterator[tuple[str, Prob
             yield content.name, problem
 
 
-def _check_coords(files: _Files, projector: Device | None) -> Float32[ndarray, "h w 2"] | None:
-    coords = files.read("sl_coords_path", read_coords)
-    problems = [] if coords is None else list(coordinate_problems(coords, projector))
+def _check_coords(files: _Files, frame: PartialFrame, projector: Device | None) -> Float32[ndarray, "h w 2"] | None:
+    stored = frame.coords_files(projector)
+    if stored is None or not set(stored.paths) <= set(files.paths.values()):
+        return None
+    try:
+        coords = stored.read()
+    except FileError as error:
+        files.faults.add(error, relative(error.path, files.root), files.frame)
+        return None
+    problem = None if projector is None or not stored.are_images else _unit_problem(coords, stored)
+    problems = list(coordinate_problems(coords, projector)) if problem is None else [problem]
     for problem in problems:
-        files.add(problem, "sl_coords_path")
+        if problem.remedy == _WRITE_NAN and len(stored.paths) == 2:
+            problem = replace(problem, remedy=_WRITE_ZERO)
+        files.add(problem, frame.coords_key)
     return None if problems else coords
+
+
+def _unit_problem(coords: Float32[ndarray, "h w 2"], stored: CoordinateFiles) -> Problem | None:
+    """What is wrong with the stated unit of images: their numbers make sense in the other one only."""
+    values, size = coords[np.isfinite(coords).all(-1)], np.array(stored.pattern, dtype=np.float32)
+    if not len(values):
+        return None
+    low, high = values.min(0), values.max(0)
+    span = f"x_p {low[0]:g} to {high[0]:g}, y_p {low[1]:g} to {high[1]:g}; pattern {size[0]:g} x {size[1]:g}"
+    if stored.units == "parts_of_65535" and (high * FULL <= (1 + _OUTSIDE) * size**2).all():
+        return Problem(
+            f"shows no more than the first {100 * float((high / size).max()):.2g} % of the pattern ({span})",
+            "the numbers are pattern pixels or shares of 1, not parts of 65535",
+            f'state "{UNITS_KEY}": "pixels" if they are pixels; multiply shares of 1 by {FULL}',
+        )
+    if stored.units == "pixels" and (high <= FULL + 1).all():
+        parts = values / FULL * size
+        if _beyond(values, size, _OUTSIDE).mean() > _MANY_OUTSIDE and _beyond(parts, size, 0.0).mean() <= _MANY_OUTSIDE:
+            share = 100 * float(_beyond(values, size, _OUTSIDE).mean())
+            return Problem(
+                f"puts {share:.0f} % of the pixels outside the pattern ({span})",
+                "the numbers are parts of 65535, or pixels of a pattern of another size",
+                f'state "{UNITS_KEY}": "parts_of_65535" if they are; else store pixels of pattern.png',
+            )
+    return None
 
 
 def _check_mask(files: _Files) -> Bool[ndarray, "h w"] | None:
@@ -403,7 +440,7 @@ def check_folder(root: Path) -> FolderCheck:
     for name, duplicate in duplicate_problems(contents):
         faults.add(duplicate, TRANSFORMS, name)
     for problem in shift_problems([content.shift for content in contents]):
-        faults.add(problem, TRANSFORMS, None, "sl_coords_path")
+        faults.add(problem, TRANSFORMS, None, _coords_key(frames))
     _check_conventions(partial, contents, faults)
     _check_images(frames, contents, good, faults)
     found = faults.found
@@ -453,7 +490,13 @@ def _check_conventions(partial: PartialScan, contents: list[FrameContent], fault
     metres = None if partial.units is None else UNITS[partial.units]
     with np.errstate(all="ignore"):
         for frame, key, problem in convention_problems(frames, partial.projector, metres):
-            faults.add(problem, TRANSFORMS, frame, key)
+            where = [one for one in partial.frames if frame in (None, one.name)]
+            faults.add(problem, TRANSFORMS, frame, _coords_key(where) if key in COORDS_KEYS else key)
+
+
+def _coords_key(frames: Sequence[PartialFrame]) -> str:
+    """The key at which frames name their coordinates; of the first of them if they differ."""
+    return frames[0].coords_key
 
 
 def _check_images(
@@ -464,10 +507,10 @@ def _check_images(
     shown = image_problems({c.name: c.match for c in contents}, lambda name: read_shown(by_name[name], good))
     captured = image_problems({c.name: c.image_match for c in contents}, lambda _: None)
     found = {**dict(captured), **dict(shown)}
-    explained = {fault.frame for fault in faults.found if fault.field == "sl_coords_path"}
+    explained = {fault.frame for fault in faults.found if fault.field in COORDS_KEYS}
     for content in contents:
         if content.name in found and not {content.name, None} & explained:
-            faults.add(found[content.name], TRANSFORMS, content.name, "sl_coords_path")
+            faults.add(found[content.name], TRANSFORMS, content.name, by_name[content.name].coords_key)
 
 
 def _faults_raised(read: Callable[[], object]) -> list[Fault]:

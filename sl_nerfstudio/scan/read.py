@@ -15,6 +15,16 @@ from numpy import ndarray
 
 from sl_nerfstudio.errors import ScanError
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.scan.coordinates import (
+    COORDS_KEYS,
+    PAIR_KEYS,
+    UNITS_KEY,
+    CoordinateFiles,
+    CoordsUnits,
+    read_coords_keys,
+    read_coords_size,
+    read_half_size,
+)
 from sl_nerfstudio.scan.document import (
     TRANSFORMS,
     Faults,
@@ -27,7 +37,7 @@ from sl_nerfstudio.scan.document import (
     read_path,
     unreadable,
 )
-from sl_nerfstudio.scan.images import ENDINGS, read_coords_size, read_header
+from sl_nerfstudio.scan.images import ENDINGS, read_header
 from sl_nerfstudio.scan.types import (
     CAMERA_KEYS,
     FARTHEST,
@@ -120,8 +130,8 @@ def _rotation_problem(R: Float64[ndarray, "3 3"]) -> Problem | None:
 
 POSES = ("transform_matrix", "projector_transform_matrix")
 SIGMA_KEYS = tuple(PoseSigma.__dataclass_fields__)
-FRAME_FILES = ("file_path", "sl_pattern_path", "sl_coords_path", "mask_path", "sl_color_path")
-_FRAME_KEYS = (*FRAME_FILES, *POSES, *CAMERA_KEYS, "sl_pose_sigma")
+PICTURES = ("file_path", "sl_pattern_path", "mask_path", "sl_color_path")
+_FRAME_KEYS = (*PICTURES, *COORDS_KEYS, UNITS_KEY, *POSES, *CAMERA_KEYS, "sl_pose_sigma")
 
 
 @dataclass
@@ -131,16 +141,32 @@ class PartialFrame:
     name: str
     camera: Device | None = None
     paths: dict[str, Path] = field(default_factory=dict)
+    coords_units: CoordsUnits | None = None
     T_world_camera: Float64[ndarray, "4 4"] | None = None
     T_world_projector: Float64[ndarray, "4 4"] | None = None
     pose_sigma: PoseSigma | None = None
 
-    def complete(self) -> Frame:
+    @property
+    def coords_key(self) -> str:
+        """The key that names the coordinates, or the first of two."""
+        return next((key for key in COORDS_KEYS if key in self.paths), COORDS_KEYS[0])
+
+    def coords_files(self, projector: Device | None) -> CoordinateFiles | None:
+        """The files of the coordinates; None if there are none, or a fault leaves open what they mean."""
+        paths = tuple(self.paths[key] for key in COORDS_KEYS if key in self.paths)
+        if len(paths) != (2 if self.coords_key in PAIR_KEYS else 1) or self.coords_units is None:
+            return None
+        if projector is None:
+            return CoordinateFiles(paths) if self.coords_units == "pixels" else None
+        return CoordinateFiles(paths, self.coords_units, (projector.w, projector.h))
+
+    def complete(self, projector: Device) -> Frame:
         """The frame, if no fault was found. Raises ValueError if a value is missing."""
         if self.camera is None or self.T_world_camera is None or self.T_world_projector is None:
             raise ValueError(f"frame {self.name} has faults")
         image, poses = self.paths["file_path"], (self.T_world_camera, self.T_world_projector)
-        pattern, coords, mask, color = map(self.paths.get, FRAME_FILES[1:])
+        pattern, mask, color = map(self.paths.get, PICTURES[1:])
+        coords = self.coords_files(projector)
         return Frame(self.name, self.camera, image, pattern, coords, mask, *poses, self.pose_sigma, color)
 
 
@@ -149,12 +175,13 @@ def read_frame(frame: Fields, top: Fields, root: Path, common: Device | None, ne
     result = PartialFrame(frame.frame or "")
     frame.check_spelling(_FRAME_KEYS)
     result.camera = read_frame_camera(frame, top) if any(key in frame.record for key in CAMERA_KEYS) else common
-    for key in FRAME_FILES:
-        needed = key == "file_path" or (key == "sl_coords_path" and need_coords)
-        if needed or frame.record.get(key) is not None:
+    for key in PICTURES:
+        if key == "file_path" or frame.record.get(key) is not None:
             path = read_path(frame, key, root)
             if path is not None:
                 result.paths[key] = path
+    coords, result.coords_units = read_coords_keys(frame, top, root, need_coords)
+    result.paths |= coords
     result.T_world_camera, result.T_world_projector = (read_pose(frame, key) for key in POSES)
     poses = result.T_world_camera, result.T_world_projector
     if poses[0] is not None and poses[1] is not None and np.array_equal(poses[0][:3, 3], poses[1][:3, 3]):
@@ -242,7 +269,8 @@ def check_together(frames: list[PartialFrame], faults: Faults) -> None:
 
 # transforms.json as a whole: what could be read of a scan, and everything that could not.
 
-_TOP_KEYS = ("sl_format", "units", *CAMERA_KEYS, "projector", "scale", "frames", "sl_pose_sigma", "sl_shrunk_by")
+_SCAN_KEYS = ("sl_format", "units", "projector", "scale", "frames", "sl_pose_sigma", "sl_shrunk_by", UNITS_KEY)
+_TOP_KEYS = (*_SCAN_KEYS, *CAMERA_KEYS)
 
 _NO_PROJECTOR = Problem(
     "is missing: there is no projector in this data set",
@@ -267,7 +295,7 @@ class PartialScan:
         """The scan, if no fault was found. Raises ValueError if a value is missing."""
         if self.units is None or self.scale is None or self.projector is None or self.pattern_path is None:
             raise ValueError("a scan with faults cannot be completed")
-        frames, shrunk_by = tuple(frame.complete() for frame in self.frames), self.shrunk_by
+        frames, shrunk_by = tuple(frame.complete(self.projector) for frame in self.frames), self.shrunk_by
         return Scan(self.root, self.units, self.scale, self.projector, self.pattern_path, frames, shrunk_by=shrunk_by)
 
 
@@ -410,7 +438,7 @@ def _frame_records(top: Fields) -> list[Any]:
 
 # The headers of a scan's files: do the files exist, are they of the right kind and size? Decodes nothing.
 
-_CHECKED = ("file_path", "sl_pattern_path", "mask_path", "sl_color_path", "sl_coords_path")
+_CHECKED = (*PICTURES, *COORDS_KEYS)
 _MAY_BE_COLOUR = ("file_path", "sl_color_path")
 
 
@@ -419,9 +447,9 @@ def check_headers(partial: PartialScan, faults: Faults) -> set[Path]:
     files = [(None, "pattern_path", partial.pattern_path, _size_of(partial.projector), "the projector has")]
     for frame in partial.frames:
         size, whose = _size_of(frame.camera), "the camera has"
-        if size is None and (coords := frame.paths.get("sl_coords_path")) is not None:
+        if size is None and (coords := frame.paths.get(frame.coords_key)) is not None:
             with suppress(FileError):
-                size, whose = read_coords_size(coords), "its coordinates are"
+                size, whose = _coords_size(frame.coords_key, coords), "its coordinates are"
         files += [(frame.name, key, frame.paths.get(key), size, whose) for key in _CHECKED]
     good: set[Path] = set()
     for frame_name, key, path, size, whose in files:
@@ -446,8 +474,8 @@ def relative(path: Path, root: Path) -> str:
 def _header_problems(key: str, path: Path, wanted: tuple[int, int] | None, whose: str) -> Iterator[Problem | FileError]:
     """What is wrong with a file by its header; `wanted`: the size that it must have, None if that is not known."""
     try:
-        header = None if key == "sl_coords_path" else read_header(path)
-        size = read_coords_size(path) if header is None else (header.w, header.h)
+        header = None if key in COORDS_KEYS else read_header(path)
+        size = _coords_size(key, path) if header is None else (header.w, header.h)
     except FileError as error:
         yield error
         return
@@ -455,6 +483,10 @@ def _header_problems(key: str, path: Path, wanted: tuple[int, int] | None, whose
         yield _wrong_size(size, wanted, whose)
     if header is not None and header.mode != "grey" and key not in _MAY_BE_COLOUR:
         yield Problem("is in colour", "it was saved by a program that writes only RGB", "save it as grey, 8 or 16 bit")
+
+
+def _coords_size(key: str, path: Path) -> tuple[int, int]:
+    return read_coords_size(path) if key == "sl_coords_path" else read_half_size(path)
 
 
 def _wrong_size(found: tuple[int, int], wanted: tuple[int, int], whose: str) -> Problem:

@@ -15,8 +15,9 @@ from sl_nerfstudio.errors import Fault, ScanError
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange, project, unproject
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
 from sl_nerfstudio.geometry.triangulation import pixel_rays, triangulate
+from sl_nerfstudio.scan.coordinates import CoordinateFiles
 from sl_nerfstudio.scan.document import TRANSFORMS, Faults, Fields, Problem
-from sl_nerfstudio.scan.images import MAX_PIXELS, as_grey, read_coords, read_image
+from sl_nerfstudio.scan.images import MAX_PIXELS, as_grey, read_image
 
 # Cameras and projectors in transforms.json, and whether their numbers can be right.
 
@@ -200,12 +201,17 @@ class Frame:
     camera: Device
     image_path: Path
     pattern_path: Path | None
-    coords_path: Path | None
+    coords_files: CoordinateFiles | None
     mask_path: Path | None
     T_world_camera: Float64[ndarray, "4 4"]
     T_world_projector: Float64[ndarray, "4 4"]
     pose_sigma: PoseSigma | None = None
     color_path: Path | None = None  # the same view without the pattern
+
+    @property
+    def coords_paths(self) -> tuple[Path, ...]:
+        """The files that hold the coordinates; none if they have not been decoded yet."""
+        return () if self.coords_files is None else self.coords_files.paths
 
     def read_image(self) -> UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]:
         """The captured image, (h, w) grey or (h, w, 3) RGB, as stored. Raises UserError if unreadable."""
@@ -221,9 +227,9 @@ class Frame:
 
     def read_coords(self) -> Float32[ndarray, "h w 2"]:
         """Pattern coordinates (x_p, y_p) of each pixel, NaN where not decoded (everywhere if there is no file)."""
-        if self.coords_path is None:
+        if self.coords_files is None:
             return np.full((self.camera.h, self.camera.w, 2), np.nan, dtype=np.float32)
-        return read_coords(self.coords_path)
+        return self.coords_files.read()
 
     def read_mask(self) -> Bool[ndarray, "h w"]:
         """Pixels where the pattern falls on the object: the mask file, else where coordinates were decoded."""

@@ -1,4 +1,4 @@
-"""Writing a scan folder; and other poses and devices for its frames, in a transforms.json beside it."""
+"""Writing a scan folder, or a copy of one; other poses and devices for its frames, in a transforms.json beside it."""
 
 import json
 from collections.abc import Sequence
@@ -11,9 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
+from sl_nerfstudio.console import track
 from sl_nerfstudio.errors import Fault, ScanError, UserError
 from sl_nerfstudio.geometry.devices import PARAMETERS, Device
 from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.scan.coordinates import COORDS_KEYS, UNITS_KEY, encode_coords
 from sl_nerfstudio.scan.document import (
     TRANSFORMS,
     Faults,
@@ -23,10 +25,11 @@ from sl_nerfstudio.scan.document import (
     Record,
     document_faults,
     frame_label,
+    read_bytes,
     read_document,
 )
-from sl_nerfstudio.scan.images import encode_coords, encode_png
-from sl_nerfstudio.scan.read import POSES, SIGMA_KEYS, pose_problem, read_frame_camera, read_pose
+from sl_nerfstudio.scan.images import encode_png
+from sl_nerfstudio.scan.read import PICTURES, POSES, SIGMA_KEYS, pose_problem, read_frame_camera, read_pose
 from sl_nerfstudio.scan.types import FORMAT, UNITS, GroundTruth, PoseSigma, Scale, Scan, read_device, scale_record
 from sl_nerfstudio.storage import NewFolder, write_atomic
 
@@ -225,6 +228,49 @@ def sigma_fields(sigma: PoseSigma) -> dict[str, float]:
 def encode_json(document: dict[str, Any]) -> bytes:
     """JSON text as UTF-8; raises ValueError for NaN and infinity, which JSON cannot hold."""
     return (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+# A copy of a scan folder, with coordinates as arrays.
+
+
+def write_copy(scan: Scan, output: Path) -> None:
+    """Write the scan to a new folder: coordinates as .npz, everything else byte for byte.
+
+    Raises UserError if the folder holds anything, and FileError for a file of the scan that cannot be read.
+    """
+    document = read_document(scan.root / TRANSFORMS)
+    with NewFolder(output) as folder:
+        for index, frame in enumerate(track(scan.frames, "writing coordinates")):
+            if frame.coords_files is not None:
+                folder.write(put_coords(document, index, frame.name), encode_coords(frame.read_coords()))
+        copy_others(folder, scan, document)
+        folder.write(TRANSFORMS, encode_json(document), last=True)
+
+
+def put_coords(document: Record, index: int, name: str) -> str:
+    """The path of a frame's new coordinates, an array, after it was put into the document."""
+    frames = document.get("frames")
+    if not isinstance(frames, list) or len(frames) <= index or Path(frames[index]["file_path"]).stem != name:
+        raise UserError(
+            f"{TRANSFORMS}: has other frames than when it was read\n"
+            "    cause:  the file was edited meanwhile\n    remedy: try again"
+        )
+    document.pop(UNITS_KEY, None)
+    for key in (*COORDS_KEYS, UNITS_KEY):
+        frames[index].pop(key, None)
+    frames[index]["sl_coords_path"] = f"coords/{name}.npz"
+    return frames[index]["sl_coords_path"]
+
+
+def copy_others(folder: NewFolder, scan: Scan, document: Record, without: Sequence[str] = ()) -> None:
+    """Every file that transforms.json names, except coordinates; the truth; and descriptions (JSON) beside them."""
+    named = [document["projector"]["pattern_path"]]
+    named += [record[key] for record in document["frames"] for key in PICTURES if record.get(key)]
+    truth = sorted(path for path in (scan.root / GROUND_TRUTH).rglob("*") if path.is_file())
+    beside = sorted(path for path in scan.root.glob("*.json") if path.name not in (TRANSFORMS, *without))
+    others = [path.relative_to(scan.root).as_posix() for path in (*truth, *beside)]
+    for path in track(dict.fromkeys([*named, *others]), "copying"):
+        folder.write(path, read_bytes(scan.root / path))
 
 
 # Poses and devices in another transforms.json: true ones read, refined ones written.

@@ -21,6 +21,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Frame, Scan, read_scan
+from sl_nerfstudio.scan.coordinates import CoordinateFiles
 from tests.formulas import rays
 
 from .faceted_scan import MADE, TRUTH, FacetedScan
@@ -56,7 +57,9 @@ def test_truth_explains_a_clean_scan_perfectly(made: FacetedScan, tmp_path: Path
 
 def test_a_known_shift_of_the_decoded_coordinates_is_the_residual(scan: Scan, tmp_path: Path) -> None:
     np.savez(tmp_path / "shifted.npz", coords=scan.frames[0].read_coords() + np.float32([0.3, -0.4]))
-    pixels, _ = pixels_of(scan, TRUTH, replace(scan.frames[0], coords_path=tmp_path / "shifted.npz"))
+    pixels, _ = pixels_of(
+        scan, TRUTH, replace(scan.frames[0], coords_files=CoordinateFiles((tmp_path / "shifted.npz",)))
+    )
     np.testing.assert_allclose(np.median(pixels.offset, axis=0), [-0.3, 0.4], atol=1e-3)
     assert np.median(pixels.coordinate) == pytest.approx(0.5, abs=1e-3)
     assert np.nanmax(np.abs(pixels.epipolar)) <= 0.5 + 1e-3  # a shift has a part along the curve, too

@@ -11,6 +11,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Frame, Scale, Scan, ScanWriter
+from sl_nerfstudio.scan.coordinates import CoordinateFiles
 from tests.formulas import look_at, pixels, rays
 
 CAMERA = Device(w=96, h=96, fl_x=160.0, fl_y=160.0, cx=48.0, cy=48.0)
@@ -45,7 +46,7 @@ def scan_of(
             writer.add_frame(name, image=image, coords=coords, mask=mask, **T)
             kinds = ("images", "png"), ("coords", "npz"), ("masks", "png")
             image_path, coords_path, mask_path = (root / f"{folder}/{name}.{ending}" for folder, ending in kinds)
-            frames.append(Frame(name, camera, image_path, None, coords_path, mask_path, **T))
+            frames.append(Frame(name, camera, image_path, None, CoordinateFiles((coords_path,)), mask_path, **T))
     return Scan(root, "mm", scale, PROJECTOR, root / "pattern.png", tuple(frames))
 
 

@@ -5,11 +5,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.lie_groups import exp_map_SE3, exp_map_SO3xR3
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.geometry.lie import exp_se3, inverse
 from sl_nerfstudio.model.model import SLModelConfig, pose_parameters
-from sl_nerfstudio.model.poses import PoseParameters
+from sl_nerfstudio.model.poses import PoseOptimizerConfig, PoseParameters, increments
 
 FRAMES = 3
 KINDS = [
@@ -18,6 +21,9 @@ KINDS = [
     {"projector_moves_by": "own pose", "about_scene": False},
     {"about_scene": False},
     {"projector_moves_by": "nothing", "refine_projector": False},
+    {"projector_moves_by": "own pose", "about_scene": False, "modes": ("SO3xR3", "SO3xR3")},
+    {"modes": ("SO3xR3", "SE3")},
+    {"projector_moves_by": "own pose", "about_scene": False, "modes": ("off", "SO3xR3")},
 ]
 ALL_KINDS = pytest.mark.parametrize("kind", KINDS)
 
@@ -104,6 +110,68 @@ def test_a_checkpoint_restores_base_start_and_increments(kind):
     other.load_state_dict(poses.state_dict())
     assert all(torch.equal(a, b) for a, b in zip(poses(), other(), strict=True))
     assert torch.equal(other.start_camera, random_poses(0)) and other.sigma.isnan().all()
+
+
+def rotation(w: np.ndarray) -> np.ndarray:
+    return Rotation.from_rotvec(w).as_matrix()
+
+
+def twist(step: np.ndarray) -> np.ndarray:
+    """The 4 x 4 matrix whose exponential a screw motion is."""
+    (x, y, z), out = step[3:], np.zeros((4, 4))
+    out[:3] = [[0, -z, y, step[0]], [z, 0, -x, step[1]], [-y, x, 0, step[2]]]
+    return out
+
+
+@pytest.mark.parametrize("size", [1e-9, 0.1, 1.0, 3.0])
+def test_increments_by_other_formulas(size):
+    """A matrix exponential by Pade's formula, rotations by scipy, and what nerfstudio itself computes."""
+    steps = size * torch.randn(5, 6, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    found = {mode: increments(mode, steps) for mode in ("SE3", "SO3xR3", "off")}
+    for i, step in enumerate(steps.numpy()):
+        np.testing.assert_allclose(found["SE3"][i], expm(twist(step)), atol=1e-13)
+        apart = np.block([[rotation(step[3:]), step[:3, None]], [np.eye(4)[3:]]])
+        np.testing.assert_allclose(found["SO3xR3"][i], apart, atol=1e-14)
+    assert torch.equal(found["off"], torch.eye(4, dtype=torch.float64).expand(5, 4, 4))
+    if size > 1e-4:  # nerfstudio's formulas lose digits of small rotations
+        np.testing.assert_allclose(found["SE3"][:, :3], exp_map_SE3(steps), atol=1e-7)
+        np.testing.assert_allclose(found["SO3xR3"][:, :3], exp_map_SO3xR3(steps), atol=1e-7)
+    largest = (found["SE3"] - found["SO3xR3"])[:, :3, 3].norm(dim=1).max()
+    assert largest > 0.1 * size**2, "the two differ in the translation by half the product of rotation and translation"
+
+
+def test_a_rotation_apart_from_the_translation_turns_a_device_about_itself():
+    poses = make(projector_moves_by="own pose", about_scene=False, modes=("SO3xR3", "SO3xR3"))
+    set_steps(poses)
+    for start, step, moved in zip((0, 1), (poses.camera_step, poses.projector_step), poses(), strict=True):
+        before, numbers = random_poses(start).numpy(), step.detach().numpy()
+        for i in range(FRAMES):
+            R = before[i, :3, :3]
+            np.testing.assert_allclose(moved[i, :3, :3].detach(), R @ rotation(numbers[i, 3:]), atol=1e-14)
+            np.testing.assert_allclose(moved[i, :3, 3].detach(), before[i, :3, 3] + R @ numbers[i, :3], atol=1e-14)
+
+
+@pytest.mark.parametrize("method", ["render", "render-independently"])
+@pytest.mark.parametrize("off", ["camera", "projector", "both"])
+def test_off_leaves_poses_bit_for_bit(method, off):
+    """What is off has no gradient, and whatever the optimiser does to the numbers, its poses stay the same bits."""
+    modes = {device: PoseOptimizerConfig("off") for device in ("camera", "projector") if off in (device, "both")}
+    config = SLModelConfig(pose_method=method, **{f"{device}_optimizer": mode for device, mode in modes.items()})
+    start, light = random_poses(0), random_poses(1)
+    poses = pose_parameters(config, start, light).double()
+    assert config.moved_by_rendering == ("camera" not in modes, "projector" not in modes)
+    assert (poses.camera_step.requires_grad, poses.projector_step.requires_grad) == config.moved_by_rendering
+    with torch.no_grad():
+        for step in (p for p in poses.parameters() if p.requires_grad):
+            step.add_(0.1)
+    camera, projector = poses()
+    same = camera.detach().numpy().tobytes() == start.numpy().tobytes()
+    assert same == ("camera" in modes)
+    if method == "render-independently" or off == "both":
+        assert (projector.detach().numpy().tobytes() == light.numpy().tobytes()) == ("projector" in modes)
+    elif off == "projector":  # of a rig: relative to its camera
+        assert torch.allclose(inverse(camera) @ projector, inverse(start) @ light, atol=1e-13)
+    assert config.adjusts_poses is False and config.renders_poses == (off != "both")
 
 
 METHODS = ("adjust", "render", "render-independently")

@@ -98,7 +98,7 @@ def test_nothing_is_overwritten_and_nothing_is_left_behind(run, scan, tmp_path, 
         check(RedecodeArguments(Path("c"), tmp_path / "new", 1))
     check(RedecodeArguments(Path("c"), tmp_path / "new"))
     assert not (tmp_path / "new").exists()
-    monkeypatch.setattr("sl_nerfstudio.redecoding.redecode._copy_others", lambda *_: 1 / 0)
+    monkeypatch.setattr("sl_nerfstudio.redecoding.redecode.copy_others", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         redecode_run(run, tmp_path / "new", 60)
     assert not (tmp_path / "new").exists()

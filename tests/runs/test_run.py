@@ -1,5 +1,6 @@
 """config.yml is read without running anything from it, and whatever it holds gives settings or a message."""
 
+import copy
 import re
 import warnings
 from pathlib import Path
@@ -10,6 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.model.poses import PoseOptimizerConfig
+from sl_nerfstudio.model.run_files import decisive_settings, settings_fingerprint
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from sl_nerfstudio.runs.run import read_config
 
@@ -96,6 +99,25 @@ def test_what_is_no_configuration(tmp_path, text, words):
     assert text != TEXT
     with pytest.raises(UserError, match=words):
         read(tmp_path, text)
+
+
+def test_a_run_without_optimisers_of_poses_is_one_that_did_not_state_them(tmp_path):
+    """It was trained before there were such settings, and goes on as it would have."""
+    text = re.sub(
+        r"\n +camera_optimizer: .*PoseOptimizerConfig\n +mode: null|\n +projector_optimizer: \*id\d+", "", TEXT
+    )
+    assert "PoseOptimizerConfig" in TEXT and "PoseOptimizerConfig" not in text and "projector_optimizer" not in text
+    config = read(tmp_path, text)
+    assert config == sl_neus.config
+    assert settings_fingerprint(config) == settings_fingerprint(sl_neus.config)
+    decided = decisive_settings(sl_neus.config)["model"]
+    assert "camera_optimizer" not in decided and "projector_optimizer" not in decided
+    chosen = copy.deepcopy(sl_neus.config)
+    chosen.pipeline.model.projector_optimizer = PoseOptimizerConfig("SO3xR3")
+    assert read(tmp_path, yaml.dump(chosen)) == chosen
+    assert settings_fingerprint(chosen) != settings_fingerprint(sl_neus.config)
+    loaded = yaml.load(text, Loader=yaml.Loader)  # as nerfstudio's own commands do
+    assert loaded.pipeline.model.moved_by_rendering == (False, False)
 
 
 EARLIER = """\

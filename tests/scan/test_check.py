@@ -14,7 +14,7 @@ from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, edit_coords, only_fault,
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import FileError, check_scan, read_scan
 from sl_nerfstudio.scan.check import check_folder
-from sl_nerfstudio.scan.images import read_coords, read_coords_size
+from sl_nerfstudio.scan.coordinates import read_coords, read_coords_size
 
 NAME = NAMES[1]
 COORDS = f"coords/{NAME}.npz"

@@ -89,7 +89,7 @@ def test_captures_without_coordinates(tmp_path):
         read_scan(tmp_path / "scan")
     scan = read_scan(tmp_path / "scan", need_coords=False)
     one = scan.frames[0]
-    assert one.coords_path is None and np.isnan(one.read_coords()).all() and not one.read_mask().any()
+    assert one.coords_files is None and np.isnan(one.read_coords()).all() and not one.read_mask().any()
 
 
 def test_true_poses_go_to_ground_truth(tmp_path):
