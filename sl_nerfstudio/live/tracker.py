@@ -19,7 +19,7 @@ from sl_nerfstudio.live.sight import Fault, Sight
 from sl_nerfstudio.live.surfels import CELLS, Surfels
 from sl_nerfstudio.parallel import one_library_thread, results
 from sl_nerfstudio.registration.assembly import LARGEST_BASELINE, Assembly
-from sl_nerfstudio.registration.evidence import Commonness, Frame, ScanEvidence
+from sl_nerfstudio.registration.evidence import Commonness, Frame, KeptResiduals, ScanEvidence
 from sl_nerfstudio.registration.pairs import (
     ANYWHERE,
     NEARBY,
@@ -335,7 +335,8 @@ class Tracker:
         common = [one.common or Commonness.none(len(one.frame.evidence.points)) for one in kept]
         noise = [float(np.median(one.noise)) if one.noise else 1.0 for one in kept]
         own = sum((m.common[0] for m in found), Commonness.none(len(frame.evidence.points)))
-        return ScanEvidence(frames, [*common, own], np.array([*noise, float(np.median([m.noise[0] for m in found]))]))
+        noise.append(float(np.median([m.noise[0] for m in found])))
+        return ScanEvidence(KeptResiduals(frames), [*common, own], np.array(noise))
 
     def _judged(self, sight: Sight, S: Similarity, edges: Sequence[PairMatch], pivots: Pivots) -> Placed:
         """The covariance of a frame's place by its pairs, and what it adds."""

@@ -78,7 +78,7 @@ NEAR_DEG, NEAR_SHIFT = 2.0, 0.08  # how far that may be: degrees, radii
 NEAR_SIGMAS = 3.0  # and what errors of both relative poses explain
 NEARLY_SAME_SHIFT = 0.01  # radii, between two places of which evidence is asked only once
 NEARLY_SAME_TRACE = 1 + 2 * np.cos(np.radians(0.5))  # of the rotation between them
-MOST_KEPT = 4000  # places of which residuals are kept, of 36 kB each
+MOST_KEPT = 3000  # places of which residuals are kept, of 72 kB each
 
 CONTRADICTING_SIGMAS = 3.0  # behind the surface, from which it is asked whether an edge hides a point
 STEEPEST = 5.0  # change of distance from place to place, in their width, beyond which a surface has an edge
@@ -716,15 +716,71 @@ class PairEvidence:
         return float(((ratio + gone) / self.area).sum())
 
 
+@dataclass
+class _Kept:
+    """Residuals at a place, and the same in units of the frames' noise as it was last known."""
+
+    place: Similarity
+    compared: Compared
+    noise: tuple[float, float] = (np.nan, np.nan)
+    scaled: Compared | None = None
+
+
+class KeptResiduals:
+    """Residuals of pairs of frames at the most likely place close to each place that was asked for.
+
+    Nearly the same place is asked for again and again, and the search looks around each all the same.
+    """
+
+    def __init__(self, frames: Sequence[FrameEvidence]) -> None:
+        self.frames = frames
+        self._found: dict[tuple[int, int], list[_Kept]] = {}
+        self._count = 0
+
+    def near(
+        self, source: int, target: int, places: Sequence[Similarity], noise: tuple[float, float]
+    ) -> list[Compared]:
+        """Residuals at each place, in units of the noise of both frames."""
+        a, b = self.frames[source], self.frames[target]
+        pair, before = PairEvidence(a, b), self._found.get((source, target), [])
+        known = [next((one for one in before if nearly_same(a, one.place, place)), None) for place in places]
+        new = [place for place, one in zip(places, known, strict=True) if one is None]
+        if new:
+            compared = pair.compare(self._likeliest_near(a, b, Places.of(*new)))
+            rows = [_Kept(place, compared.chosen(np.array([k]))) for k, place in enumerate(new)]
+            if self._count > MOST_KEPT:
+                self._found.clear()
+                self._count = 0
+            self._found.setdefault((source, target), []).extend(rows)
+            self._count += len(new)
+            following = iter(rows)
+            known = [next(following) if one is None else one for one in known]
+        found: list[Compared] = []
+        for one in known:
+            assert one is not None
+            if one.scaled is None or one.noise != noise:
+                one.noise, one.scaled = noise, pair.scaled(one.compared, noise)
+            found.append(one.scaled)
+        return found
+
+    @staticmethod
+    def _likeliest_near(a: FrameEvidence, b: FrameEvidence, start: Places) -> Places:
+        """The most likely place close to each, or the place itself if the search leaves it."""
+        near, _ = PairEvidence(a, b, NEAR_THINNED).refined(start, NEAR_WIDTHS)
+        turned = np.degrees(np.arccos(np.clip((np.einsum("kij,kij->k", near.R, start.R) - 1) / 2, -1, 1)))
+        p = np.einsum("kji,kj->ki", start.R, b.centroid - start.t) / start.scale[:, None]
+        shift = near.scale[:, None] * np.einsum("kij,kj->ki", near.R, p) + near.t - b.centroid
+        by_poses = NEAR_SIGMAS * np.hypot(start.scale * a.depth_sigma, b.depth_sigma)
+        left = (turned > NEAR_DEG) | (np.linalg.norm(shift, axis=1) > NEAR_SHIFT * b.radius + by_poses)
+        both = Places.joined([start, near])
+        return both[np.where(left, 0, len(start)) + np.arange(len(start))]
+
+
 class ScanEvidence:
     """Any two frames of a scan compared at any place, by what its pairs have shown of each frame's points."""
 
-    def __init__(
-        self, frames: Sequence[FrameEvidence], common: Sequence[Commonness], noise: Float64[ndarray, "n"]
-    ) -> None:
-        self.frames, self.common, self.noise = frames, common, noise
-        self._compared: dict[tuple[int, int], list[tuple[Similarity, Compared]]] = {}  # places, each as it was found
-        self._kept = 0
+    def __init__(self, residuals: KeptResiduals, common: Sequence[Commonness], noise: Float64[ndarray, "n"]) -> None:
+        self._residuals, self.frames, self.common, self.noise = residuals, residuals.frames, common, noise
 
     def comparison(self, source: int, target: int, places: Sequence[Similarity | None]) -> Comparison:
         """Compare places of two frames; None: there the frames do not face each other."""
@@ -754,41 +810,12 @@ class ScanEvidence:
         return float(odds[0]), float(agreeing), float(expected)
 
     def _near(self, source: int, target: int, places: Sequence[Similarity]) -> tuple[PairEvidence, Compared] | None:
-        """Residuals at the most likely place close to each; None if a frame has no points.
-
-        Where nearly the same place was compared before they are kept: the search looks around each all the same.
-        """
+        """Residuals at the most likely place close to each; None if a frame has no points."""
         a, b = self.frames[source], self.frames[target]
         if not (places and len(a.points) and len(b.points)):
             return None
-        before = self._compared.get((source, target), [])
-        known = [next((found for S, found in before if nearly_same(a, S, place)), None) for place in places]
-        new = [place for place, found in zip(places, known, strict=True) if found is None]
-        every = PairEvidence(a, b)
-        if new:
-            noise = float(self.noise[source]), float(self.noise[target])
-            found = every.scaled(every.compare(self._likeliest_near(a, b, Places.of(*new))), noise)
-            rows = [found.chosen(np.array([k])) for k in range(len(new))]
-            if self._kept > MOST_KEPT:
-                self._compared.clear()
-                self._kept = 0
-            self._compared.setdefault((source, target), []).extend(zip(new, rows, strict=True))
-            self._kept += len(new)
-            following = iter(rows)
-            known = [next(following) if found is None else found for found in known]
-        return every, Compared.joined([found for found in known if found is not None])
-
-    @staticmethod
-    def _likeliest_near(a: FrameEvidence, b: FrameEvidence, start: Places) -> Places:
-        """The most likely place close to each, or the place itself if the search leaves it."""
-        near, _ = PairEvidence(a, b, NEAR_THINNED).refined(start, NEAR_WIDTHS)
-        turned = np.degrees(np.arccos(np.clip((np.einsum("kij,kij->k", near.R, start.R) - 1) / 2, -1, 1)))
-        p = np.einsum("kji,kj->ki", start.R, b.centroid - start.t) / start.scale[:, None]
-        shift = near.scale[:, None] * np.einsum("kij,kj->ki", near.R, p) + near.t - b.centroid
-        by_poses = NEAR_SIGMAS * np.hypot(start.scale * a.depth_sigma, b.depth_sigma)
-        left = (turned > NEAR_DEG) | (np.linalg.norm(shift, axis=1) > NEAR_SHIFT * b.radius + by_poses)
-        both = Places.joined([start, near])
-        return both[np.where(left, 0, len(start)) + np.arange(len(start))]
+        noise = float(self.noise[source]), float(self.noise[target])
+        return PairEvidence(a, b), Compared.joined(self._residuals.near(source, target, places, noise))
 
 
 def nearly_same(source: FrameEvidence, S: Similarity, place: Similarity) -> bool:

@@ -152,14 +152,15 @@ def _optimised(
         step, cost = np.zeros((len(pivots), 7)), _cost(edges, residuals, weight, width2)
         if len(free):
             step[free] = _step(edges, adjoints, residuals, weight, width2, free, len(pivots))
+        taken = False
         for factor in STEP_FACTORS:
             moved = nodes @ exps_at(factor * step, pivots.centre, pivots.radius, LARGEST_LOG_SCALE_STEP)
             there = edges.residuals(moved, pivots)
             if _cost(edges, there, weight, width2) <= cost:
-                nodes, residuals = moved, there
+                nodes, residuals, taken = moved, there, True
                 break
-        if width2 <= KERNEL_CHI2 and np.abs(step).max() < CONVERGED:
-            break
+        if width2 <= KERNEL_CHI2 and (not taken or np.abs(step).max() < CONVERGED):
+            break  # without a step that costs less, the next one would be the same
         width2 = max(KERNEL_CHI2, width2 / KERNEL_SHRINKAGE)
     return nodes
 

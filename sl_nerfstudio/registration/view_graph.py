@@ -17,7 +17,7 @@ from sl_nerfstudio.parallel import tracked
 from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, COARSE_POINTS, Side, Tolerance, agreement_at
 from sl_nerfstudio.registration.assembly import Assembly, see_same_side
 from sl_nerfstudio.registration.blocks import BlockReview, OpenBlock, Sides
-from sl_nerfstudio.registration.evidence import Commonness, Frame, ScanEvidence
+from sl_nerfstudio.registration.evidence import Commonness, Frame, KeptResiduals, ScanEvidence
 from sl_nerfstudio.registration.pairs import (
     ANYWHERE,
     LEAST_ODDS,
@@ -178,10 +178,12 @@ class ViewGraph:
         self.pivots = Pivots(np.stack([m.centroid for m in self.maps]), np.array([m.radius for m in self.maps]))
         self.sides = [Side.sampled(m, COARSE_POINTS, rng) for m in self.maps]
         self.step: UsualStep | None = None  # None: the order of capture says nothing
+        self._residuals = KeptResiduals([frame.evidence for frame in frames])
         self._tried: dict[Pair, PairMatch | None] = {}
         self._searched: set[tuple[Pair, Search]] = set()
         self.open: list[OpenBlock] = []  # what the last assembly left undecided
         self._reviews: list[BlockReview] = []  # of the last assembly
+        self._components: list[Component] | None = None  # of it, while nothing new is known
 
     @property
     def matches(self) -> list[PairMatch]:
@@ -248,6 +250,11 @@ class ViewGraph:
         Pairs that may slip connect nothing, unless all of them may: then the surface is one of revolution, and its
         frames are put together all the same.
         """
+        if self._components is None:
+            self._components = self._assembled()
+        return self._components
+
+    def _assembled(self) -> list[Component]:
         edges, scan = self.edges, self.evidence()
         self._reviews, self.open = [], []
         assembly = self.assembly([e for e in edges if e.holds], scan)
@@ -282,21 +289,20 @@ class ViewGraph:
 
     def evidence(self) -> ScanEvidence:
         """All frames, with what pairs have shown of their points."""
-        frames = [frame.evidence for frame in self.frames]
-        common = [Commonness.none(len(frame.points)) for frame in frames]
-        noise: list[list[float]] = [[] for _ in frames]
+        common = [Commonness.none(len(frame.evidence.points)) for frame in self.frames]
+        noise: list[list[float]] = [[] for _ in self.frames]
         for match in self.matches:
             for k, each, size in zip((match.source, match.target), match.common, match.noise, strict=True):
                 common[k] = common[k] + each
                 noise[k].append(size)
-        return ScanEvidence(frames, common, np.array([np.median(each) if each else 1.0 for each in noise]))
+        return ScanEvidence(self._residuals, common, np.array([np.median(each) if each else 1.0 for each in noise]))
 
     def learn_step(self) -> None:
         """How the camera usually turns between successive frames: what makes the places of their pairs likeliest.
 
         None if turns do not grow with the number of frames that lie between, as those in no order do not.
         """
-        self.step = None
+        self.step = self._components = None
         pairs = [e for e in self.edges if abs(e.target - e.source) <= LARGEST_GAP and e.holds]
         if sum(abs(e.target - e.source) == 1 for e in pairs) <= LEAST_STEPS * (len(self.frames) - 1):
             return
@@ -328,6 +334,8 @@ class ViewGraph:
             partial(register_pair, self._frames(pair), pair, search, rng, guess, self._known(pair))
             for (pair, search, guess), rng in zip(trials, rngs, strict=True)
         ]
+        if trials:
+            self._components = None
         for (pair, _, _), match in zip(trials, tracked(tasks, words), strict=True):
             if match is not None or pair not in self._tried:
                 self._tried[pair] = match

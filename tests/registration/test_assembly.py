@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.registration.assembly import Assembly
-from sl_nerfstudio.registration.evidence import Commonness, FrameEvidence, ScanEvidence, frame_evidence
+from sl_nerfstudio.registration.evidence import Commonness, FrameEvidence, KeptResiduals, ScanEvidence, frame_evidence
 from sl_nerfstudio.registration.pairs import LEAST_ODDS, PairMatch, Rival
 from sl_nerfstudio.registration.pose_graph import Pivots
 from sl_nerfstudio.registration.surfaces import frame_cloud
@@ -32,7 +32,7 @@ def frames() -> list[FrameEvidence]:
 
 def evidence_of(frames) -> ScanEvidence:
     """Of frames of whose points no pair has shown anything."""
-    return ScanEvidence(frames, [Commonness.none(len(f.points)) for f in frames], np.ones(len(frames)))
+    return ScanEvidence(KeptResiduals(frames), [Commonness.none(len(f.points)) for f in frames], np.ones(len(frames)))
 
 
 def assembly_of(frames, edges, **kwargs) -> Assembly:

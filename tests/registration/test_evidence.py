@@ -26,8 +26,10 @@ from sl_nerfstudio.registration.evidence import (
     UNKNOWNS,
     Commonness,
     FrameEvidence,
+    KeptResiduals,
     PairEvidence,
     Places,
+    ScanEvidence,
     frame_evidence,
 )
 from sl_nerfstudio.registration.pairs import (
@@ -337,6 +339,19 @@ def test_places_are_compared_alike_whichever_frame_is_the_source_and_whatever_th
         np.testing.assert_allclose(evidence.comparison(other, known).leads, leads, atol=0.02)
         np.testing.assert_allclose(evidence.log_odds(other, known), forward.log_odds(found, common), atol=0.02)
         np.testing.assert_allclose(evidence.by_likelihood(other), forward.by_likelihood(found), atol=0.02)
+
+
+def test_residuals_that_were_kept_are_in_units_of_the_noise_as_it_is_known_now(compared):
+    source, target, true = compared[0], compared[1], compared[2].similarity(0)
+    here = [true, exp_at(0.1 * np.eye(7)[4], target.centroid, target.radius, 1.0) @ true]
+    kept, common = KeptResiduals([source, target]), no_knowledge(source, target)
+    leads = []
+    for noise in (1.0, 3.0, 1.0):
+        again = ScanEvidence(kept, common, np.full(2, noise)).comparison(0, 1, here).leads
+        fresh = ScanEvidence(KeptResiduals([source, target]), common, np.full(2, noise)).comparison(0, 1, here).leads
+        np.testing.assert_array_equal(again, fresh)
+        leads.append(float(again[0, 1]))
+    assert leads[0] == leads[2] > 1.5 * leads[1] > 0
 
 
 def in_units(frame: FrameEvidence, factor: float) -> FrameEvidence:
