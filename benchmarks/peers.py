@@ -10,7 +10,7 @@ and every surface is compared after a similarity. Rows that are in the result fi
 
 import shutil
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -18,24 +18,23 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import open3d as o3d
-import pycolmap
 from jaxtyping import Float64
 from numpy import ndarray
-from scipy.spatial import KDTree
 
-from benchmarks.baselines.poses import oriented_cloud, register
-from benchmarks.baselines.tsdf import backprojected, depth_maps, fuse, largest_pieces, object_size
+from benchmarks.baselines.colmap import Cameras, structure_from_motion
+from benchmarks.baselines.poisson import poisson
+from benchmarks.baselines.poses import register
+from benchmarks.baselines.tsdf import fuse
 from benchmarks.common.measuring import Rows, kept_rows, options
 from benchmarks.common.runs import export, process, train
 from benchmarks.photographs.scoring import WRONG_DEG, Truth, read_truth
 from benchmarks.photographs.sets import captures_of, config_of, note_of
 from benchmarks.photographs.surface import OBJECT_MM
+from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import SurfaceScore, score_alignments
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import align_poses, mesh_reference
-from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, angle_deg
 from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
@@ -92,44 +91,6 @@ def render_without_pattern(captures: Path, config: SynthConfig, light: Light) ->
     return started.rename(folder)
 
 
-# COLMAP.
-
-Cameras = Mapping[str, Float64[ndarray, "4 4"]]
-"""Poses of cameras, camera to world, by the names of their images."""
-_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # COLMAP's camera axes to ours, on the right
-
-
-def structure_from_motion(images: Path, camera: Device, work: Path) -> Cameras:
-    """Cameras of COLMAP's largest model: SIFT, all pairs, its default settings, intrinsics given and kept; one core."""
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    database, on_cpu = work / "database.db", pycolmap.Device.cpu
-    given = (camera.fl_x, camera.fl_y, camera.cx, camera.cy, camera.k1, camera.k2, camera.p1, camera.p2)
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model, reader.camera_params = "OPENCV", ",".join(map(str, given))
-    extraction, matching = pycolmap.FeatureExtractionOptions(), pycolmap.FeatureMatchingOptions()
-    extraction.num_threads = matching.num_threads = 1
-    pycolmap.set_random_seed(0)
-    pycolmap.extract_features(
-        database, images, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
-        extraction_options=extraction, device=on_cpu,
-    )  # fmt: skip
-    pycolmap.match_exhaustive(database, matching_options=matching, device=on_cpu)
-    mapping = pycolmap.IncrementalPipelineOptions()
-    mapping.num_threads, mapping.random_seed = 1, 0
-    mapping.ba_refine_focal_length = mapping.ba_refine_extra_params = False
-    models = pycolmap.incremental_mapping(database, images, work, mapping)
-    if not models:
-        return {}
-    largest = max(models.values(), key=lambda model: model.num_reg_images())
-    posed = [image for image in largest.images.values() if image.has_pose]
-    return {Path(image.name).stem: _camera_pose(image.cam_from_world().matrix()) for image in posed}
-
-
-def _camera_pose(T_camera_world: Float64[ndarray, "3 4"]) -> Float64[ndarray, "4 4"]:
-    return np.linalg.inv(np.vstack([T_camera_world, [0.0, 0.0, 0.0, 1.0]])) @ _OPENCV
-
-
 # Cameras against the truth.
 
 _WRONG_CENTRE = 0.15  # of the object's size: what WRONG_DEG about the object moves a camera three sizes away
@@ -176,29 +137,6 @@ def _after(
     turns = np.swapaxes(T_true[:, :3, :3], 1, 2) @ placed[:, :3, :3]
     centre = np.linalg.norm(placed[:, :3, 3] - T_true[:, :3, 3], axis=1) / size
     return CameraErrors(np.array([angle_deg(turn) for turn in turns]), centre)
-
-
-# Surfaces.
-
-_UNIT = 100.0  # the object is scaled to about this size
-_VOXEL = 1 / 250  # of the object's size: one point each, as fusion's voxels
-_DEPTH = 9  # of Poisson's octree
-_FARTHEST_VOXELS = 4.0  # from the points: Poisson's surface beyond was closed, not measured
-
-
-def poisson(scan: Scan, poses: DevicePoses) -> Mesh:
-    """Poisson's surface (Open3D) of the triangulated points of all frames, where there are points."""
-    depths = depth_maps(scan, poses)
-    unit, voxel = _UNIT / object_size(depths), _VOXEL * _UNIT
-    cloud = o3d.geometry.PointCloud()
-    for depth, T in zip(depths, poses.T_world_camera, strict=True):
-        scaled = T.copy()
-        scaled[:3, 3] *= unit
-        cloud += oriented_cloud(backprojected(depth) * unit, scaled, voxel)
-    mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=_DEPTH, n_threads=1)
-    far = KDTree(np.asarray(cloud.points)).query(np.asarray(mesh.vertices))[0] > _FARTHEST_VOXELS * voxel
-    mesh.remove_vertices_by_mask(far)
-    return largest_pieces(mesh, unit)
 
 
 # One set of photographs, and what is measured on it.
@@ -275,9 +213,9 @@ Surface = Callable[[Case, Scan], tuple[Mesh, DevicePoses]]
 
 def ours(case: Case, scan: Scan) -> tuple[Mesh, DevicePoses]:
     """Train with the default steps, and export."""
-    run, mesh, poses = case.folder / "run", case.folder / "mesh.ply", case.folder / "refined"
-    shutil.rmtree(run, ignore_errors=True)
-    export(train(scan.root, run, "now"), mesh, poses)
+    trained, mesh, poses = case.folder / "run", case.folder / "mesh.ply", case.folder / "refined"
+    shutil.rmtree(trained, ignore_errors=True)
+    export(train(scan.root, trained, "now"), mesh, poses)
     return read_mesh(mesh), read_poses(poses / "transforms.json", scan)
 
 
@@ -352,11 +290,15 @@ def _row(case: Case, method: str, needs: str, cameras: Cameras, score: SurfaceSc
     placed = {name: T for name, T in cameras.items() if name in usable}
     errors = camera_errors(placed, case.true_cameras, case.truth.size)
     deg, share = (float(np.median(e)) if len(e) else None for e in (errors.deg, errors.centre))
-    surface = (None,) * 3 if score is None else (
-        score.accuracy.rmse * mm, score.accuracy.median * mm, score.completeness.rmse * mm)  # fmt: skip
+    rmse, median, missing = (None,) * 3 if score is None else [
+        mm * d for d in (score.accuracy.rmse, score.accuracy.median, score.completeness.rmse)]  # fmt: skip
     light = PLACINGS[method][1] if method in PLACINGS else None
     given = "the frames of sl-process" if method in SURFACES else f"photographs, {light or 'pattern'}"
-    return Row(case.name, method, given, needs, len(usable), len(placed), errors.right, deg, share, *surface, seconds)
+    return Row(
+        set=case.name, method=method, given=given, needs=needs, usable=len(usable), placed=len(placed),
+        right=errors.right, camera_deg=deg, camera_share=share, rmse=rmse, median=median, completeness=missing,
+        seconds=seconds,
+    )  # fmt: skip
 
 
 def main() -> None:
@@ -375,4 +317,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run(main)

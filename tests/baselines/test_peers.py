@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from benchmarks.peers import _camera_pose, camera_errors, poisson, without_pattern
+from benchmarks.baselines.colmap import camera_pose
+from benchmarks.baselines.poisson import poisson
+from benchmarks.peers import camera_errors, without_pattern
 from sl_nerfstudio.evaluation.evaluate import score_alignments
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import mesh_reference
@@ -53,7 +55,7 @@ def test_a_camera_of_colmap_looks_along_its_own_z_axis() -> None:
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = Rotation.random(random_state=5).as_matrix()
     T_world_camera[:3, 3] = 1.0, 2.0, 3.0
-    ours = _camera_pose(np.linalg.inv(T_world_camera)[:3])
+    ours = camera_pose(np.linalg.inv(T_world_camera)[:3])
     np.testing.assert_allclose(ours[:3, 3], T_world_camera[:3, 3], atol=1e-12)
     np.testing.assert_allclose(-ours[:3, 2], T_world_camera[:3, 2], atol=1e-12)
     np.testing.assert_allclose(ours[:3, 0], T_world_camera[:3, 0], atol=1e-12)
@@ -70,7 +72,6 @@ def test_without_the_pattern_the_light_is_constant_or_does_not_depend_on_the_pro
             return lit.render(0, 1).radiance
         return lit.photograph(0, 1, lit.photography, 0).image.astype(np.float64)
 
-    assert image("room", 0).mean() > image("room", 0).min()
     np.testing.assert_array_equal(image("room", 0), image("room", 2))
     assert np.abs(image("constant", 0) - image("constant", 2)).max() > 0
     flat = without_pattern(setup, "constant")
