@@ -88,6 +88,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_poissons_surface_of_exact_points_is_the_true_one_and_goes_no_farther_than_the_points(clean: Path) -> None:
     scan = read_scan(clean)
     truth = read_ground_truth(scan)
