@@ -310,9 +310,10 @@ def main() -> None:
     rows: Rows[Row] = Rows(given.output, kept_rows(given.output, Row), frames=given.frames, resolution=given.resolution)
     for name in given.sets:
         captures = captures_of(name, given.frames, given.resolution, given.keep)
-        case = Case(name, captures, config_of(name, given.frames, given.resolution, given.keep), read_truth(captures))
+        config = config_of(name, given.frames, given.resolution, given.keep)
+        case = Case(captures.name, captures, config, read_truth(captures))
         for method in given.methods:
-            if not any((row.set, row.method) == (name, method) for row in rows):
+            if not any((row.set, row.method) == (case.name, method) for row in rows):
                 rows.add(measure(case, method))
 
 
