@@ -1,4 +1,4 @@
-"""Classical methods to compare with: TSDF fusion, ICP registration, window matching.
+"""Classical methods to compare with: COLMAP, TSDF fusion, Poisson's surface, ICP registration, window matching.
 
-In: a scan with poses, or the nodes that the decoder found. Out: a mesh, registered poses, or matched nodes.
+In: photographs, a scan with poses, or the nodes that the decoder found. Out: poses, a mesh, or matched nodes.
 """

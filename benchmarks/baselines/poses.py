@@ -30,7 +30,7 @@ def register(scan: Scan, poses: DevicePoses, rounds: int = 2) -> DevicePoses:
     unit = _SIZE / size
     start = poses.T_world_camera.copy()
     start[:, :3, 3] *= unit
-    clouds = [_cloud(backprojected(d) * unit, T, _VOXEL * _SIZE) for d, T in zip(depths, start, strict=True)]
+    clouds = [oriented_cloud(backprojected(d) * unit, T, _VOXEL * _SIZE) for d, T in zip(depths, start, strict=True)]
     motion = np.tile(np.eye(4), (len(clouds), 1, 1))
     for distances in (_DISTANCES, *[_DISTANCES[1:]] * (rounds - 1)):
         moved = [o3d.geometry.PointCloud(c).transform(T) for c, T in zip(clouds, motion, strict=True)]
@@ -40,7 +40,8 @@ def register(scan: Scan, poses: DevicePoses, rounds: int = 2) -> DevicePoses:
     return DevicePoses(motion @ poses.T_world_camera, motion @ poses.T_world_projector)
 
 
-def _cloud(p_camera: Float[ndarray, "n 3"], T: Float[ndarray, "4 4"], voxel: float) -> o3d.geometry.PointCloud:
+def oriented_cloud(p_camera: Float[ndarray, "n 3"], T: Float[ndarray, "4 4"], voxel: float) -> o3d.geometry.PointCloud:
+    """Points in world axes, one for each voxel, without stray ones, with normals towards the camera at `T`."""
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p_camera @ T[:3, :3].T + T[:3, 3]))
     cloud = cloud.voxel_down_sample(voxel)
     cloud, _ = cloud.remove_statistical_outlier(20, 2.0)

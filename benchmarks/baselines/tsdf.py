@@ -113,7 +113,7 @@ def fuse(scan: Scan, poses: DevicePoses, voxel_share: float = 1 / 250) -> Mesh:
             grey, image, depth_scale=1.0, depth_trunc=1e9, convert_rgb_to_intensity=False
         )
         volume.integrate(rgbd, intrinsic, np.linalg.inv(scaled @ _OPENCV))
-    return _largest_pieces(volume.extract_triangle_mesh(), unit)
+    return largest_pieces(volume.extract_triangle_mesh(), unit)
 
 
 def depth_maps(scan: Scan, poses: DevicePoses) -> list[DepthMap]:
@@ -142,7 +142,8 @@ def backprojected(depth: DepthMap) -> Float[ndarray, "n 3"]:
     return np.stack([x * z, -y * z, -z], 1)
 
 
-def _largest_pieces(mesh: o3d.geometry.TriangleMesh, unit: float) -> Mesh:
+def largest_pieces(mesh: o3d.geometry.TriangleMesh, unit: float) -> Mesh:
+    """A mesh without small pieces, its lengths divided by `unit`."""
     piece, count, _ = mesh.cluster_connected_triangles()
     piece, count = np.asarray(piece), np.asarray(count)
     whole = Mesh(np.asarray(mesh.vertices) / unit, np.asarray(mesh.triangles).astype(np.int64))

@@ -75,8 +75,8 @@ def note_of(captures: Path) -> dict[str, Any]:
     return dict(json.loads((captures / SET).read_text()))
 
 
-def captures_of(name: str, frames: int, resolution: int, folder: Path) -> Path:
-    """The captures of a set below `folder`, rendered unless an earlier run did so completely."""
+def config_of(name: str, frames: int, resolution: int, folder: Path) -> SynthConfig:
+    """The settings with which a set is rendered; its pattern's file lies in `folder`. Raises UserError."""
     parts = _NAME.fullmatch(name)
     if parts is None or parts[1] not in {**BUILT_IN, **PARTS}:
         raise UserError(
@@ -85,22 +85,26 @@ def captures_of(name: str, frames: int, resolution: int, folder: Path) -> Path:
             "frames go around half of the object"
         )
     scene, background, appearance, seed, order = parts.groups()
+    return SynthConfig(
+        scene=scene, background=cast(Background, background), appearance=cast(AppearanceKind, appearance),
+        seed=int(seed), frames=frames, resolution=resolution, pattern=folder / "pattern.json",
+        path="half-turn" if order == "-half" else "hand-held", images_only=True,
+    )  # fmt: skip
+
+
+def captures_of(name: str, frames: int, resolution: int, folder: Path) -> Path:
+    """The captures of a set below `folder`, rendered unless an earlier run did so completely."""
+    config = config_of(name, frames, resolution, folder)
     root = folder / f"{name}-{frames}-{resolution}"
     if root.exists():
         return root
-    pattern = folder / "pattern.json"
-    write_atomic(pattern, PATTERN.encode())
-    config = SynthConfig(
-        scene=scene, background=cast(Background, background), appearance=cast(AppearanceKind, appearance),
-        seed=int(seed), frames=frames, resolution=resolution, pattern=pattern,
-        path="half-turn" if order == "-half" else "hand-held", images_only=True,
-    )  # fmt: skip
+    write_atomic(folder / "pattern.json", PATTERN.encode())
     # two runs side by side, or one that is interrupted, must not leave half a set under its name
     started = folder / f".{root.name}-{os.getpid()}"
     shutil.rmtree(started, ignore_errors=True)
     synthesise(config, started)
-    numbers = _numbers(started / "images", int(seed) if order == "-shuffled" else None)
-    note = {"unordered": name in _TOLD, "appearance": appearance, "frames": numbers}
+    numbers = _numbers(started / "images", config.seed if name.endswith("-shuffled") else None)
+    note = {"unordered": name in _TOLD, "appearance": config.appearance, "frames": numbers}
     (started / SET).write_text(json.dumps(note, indent=1) + "\n")
     try:
         started.rename(root)
