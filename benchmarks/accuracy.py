@@ -49,17 +49,14 @@ class Row(Score):
     variant: str
 
 
-def measure(
-    scene: str, seed: int, method: str, iterations: int, folder: Path, variants: Sequence[str]
-) -> Iterator[Row]:
-    """Train and score all variants on one scan."""
-    scan = folder / "scan"
-    run("sl-synth", "--output", scan, "--scene", scene, "--frames", FRAMES[scene], "--seed", seed)
+def scored(scan: Path, folder: Path, method: str, steps: int, variants: Sequence[str]) -> Iterator[tuple[str, Score]]:
+    """Train and score all variants on one scan with truth."""
     for variant in variants:
         data = with_true_poses(scan, folder / "true") if variant == "oracle" else scan
-        flags = ("--max-num-iterations", str(iterations), *VARIANTS[variant])
-        score = train_and_score(data, folder, variant, flags, method)
-        yield Row(**asdict(score), scene=scene, seed=seed, variant=variant)
+        yield (
+            variant,
+            train_and_score(data, folder, variant, ("--max-num-iterations", str(steps), *VARIANTS[variant]), method),
+        )
 
 
 def main() -> None:
@@ -74,8 +71,10 @@ def main() -> None:
         for scene in given.scenes:
             folder = given.folder / f"{scene}-{seed}"
             folder.mkdir()
-            for row in measure(scene, seed, given.method, given.iterations, folder, given.variants):
-                rows.add(row)
+            scan = folder / "scan"
+            run("sl-synth", "--output", scan, "--scene", scene, "--frames", FRAMES[scene], "--seed", seed)
+            for variant, score in scored(scan, folder, given.method, given.iterations, given.variants):
+                rows.add(Row(**asdict(score), scene=scene, seed=seed, variant=variant))
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 
     python -m benchmarks.tsdf_baseline SCAN [SCAN ...] [--poses refined] [--output results.json]
 
-Fusion with our refined poses, those with which `sl-neus` trains, tells what the field adds to the poses.
+Fusion with our refined poses, those with which `sl-neus` trains, tells what the field adds to the poses. `tracked` is
+fusion frame to model, as KinectFusion does it: frames are tracked against what was fused before them.
 """
 
 import argparse
@@ -11,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.baselines.frame_to_model import fuse_frame_to_model
 from benchmarks.baselines.poses import refined_poses, register
 from benchmarks.baselines.tsdf import fuse
 from benchmarks.common.measuring import Rows
@@ -21,12 +23,29 @@ from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import compare_poses, mesh_reference
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.files import read_mesh
+from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
 
-POSES: dict[str, Callable[[Scan, DevicePoses], DevicePoses]] = {
-    "initial": lambda scan, true: scan.poses, "registered": lambda scan, true: register(scan, scan.poses),
-    "refined": lambda scan, true: refined_poses(scan), "true": lambda scan, true: true,
-}  # fmt: skip
+Fused = tuple[Mesh, DevicePoses]
+
+
+def _with(poses: Callable[[Scan, DevicePoses], DevicePoses]) -> Callable[[Scan, DevicePoses], Fused]:
+    """Fusion with these poses, which are found first."""
+
+    def fused(scan: Scan, true: DevicePoses) -> Fused:
+        found = poses(scan, true)
+        return fuse(scan, found), found
+
+    return fused
+
+
+POSES: dict[str, Callable[[Scan, DevicePoses], Fused]] = {
+    "initial": _with(lambda scan, true: scan.poses),
+    "tracked": lambda scan, true: fuse_frame_to_model(scan, scan.poses),
+    "registered": _with(lambda scan, true: register(scan, scan.poses)),
+    "refined": _with(lambda scan, true: refined_poses(scan)),
+    "true": _with(lambda scan, true: true),
+}
 
 
 @dataclass(frozen=True)
@@ -56,8 +75,7 @@ def measure(root: Path, kinds: Sequence[str]) -> Iterator[Row]:
     reference = mesh_reference(read_mesh(truth.mesh_path), scan, truth.poses)
     for name in kinds:
         start = time.perf_counter()
-        poses = POSES[name](scan, truth.poses)
-        mesh = fuse(scan, poses)
+        mesh, poses = POSES[name](scan, truth.poses)
         seconds = time.perf_counter() - start
         scores = score_alignments(IndexedMesh(mesh), reference, poses, truth.poses)
         camera, rigid, similarity = compare_poses(poses, truth.poses).camera, scores["rigid"], scores["similarity"]

@@ -83,37 +83,56 @@ def _undistorted(depth: Float[ndarray, "h w"], camera: Device) -> DepthMap:
     return DepthMap(out, pinhole)
 
 
-_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes to OpenCV's, on the right
+OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes to OpenCV's, on the right
 _TRUNCATION_VOXELS = 5.0
 _LEAST_PIECE = 0.02  # of the largest connected piece's triangles; smaller pieces are dropped
-_UNIT_SIZE = 100.0  # the object is scaled to about this size: Open3D's defaults assume it
+UNIT_SIZE = 100.0  # the object is scaled to about this size: Open3D's defaults assume it
+
+
+class Volume:
+    """A truncated signed distance, of an object that is scaled to `UNIT_SIZE`."""
+
+    def __init__(self, size: float, voxel_share: float) -> None:
+        """`size` of the object, in the world's unit. Voxels are a share of it."""
+        self.unit = UNIT_SIZE / size
+        voxel = voxel_share * UNIT_SIZE
+        self._tsdf = o3d.pipelines.integration.ScalableTSDFVolume(
+            voxel_length=voxel,
+            sdf_trunc=_TRUNCATION_VOXELS * voxel,
+            color_type=o3d.pipelines.integration.TSDFVolumeColorType.NoColor,
+        )
+
+    def integrate(self, depth: DepthMap, T_world_camera: Float[ndarray, "4 4"]) -> None:
+        """Add a depth map."""
+        camera = depth.camera
+        intrinsic = o3d.camera.PinholeCameraIntrinsic(
+            camera.w, camera.h, camera.fl_x, camera.fl_y, camera.cx - 0.5, camera.cy - 0.5
+        )
+        scaled = T_world_camera.copy()
+        scaled[:3, 3] *= self.unit
+        image = o3d.geometry.Image((depth.depth * self.unit).astype(np.float32))
+        grey = o3d.geometry.Image(np.zeros(depth.depth.shape, np.uint8))
+        rgbd = o3d.geometry.RGBDImage.create_from_color_and_depth(
+            grey, image, depth_scale=1.0, depth_trunc=1e9, convert_rgb_to_intensity=False
+        )
+        self._tsdf.integrate(rgbd, intrinsic, np.linalg.inv(scaled @ OPENCV))
+
+    def surface(self) -> o3d.geometry.TriangleMesh:
+        """All of the surface, scaled."""
+        return self._tsdf.extract_triangle_mesh()
+
+    def mesh(self) -> Mesh:
+        """The surface without small pieces, in the world's unit."""
+        return largest_pieces(self.surface(), self.unit)
 
 
 def fuse(scan: Scan, poses: DevicePoses, voxel_share: float = 1 / 250) -> Mesh:
     """TSDF fusion of the scan's triangulated depth maps; world units and axes. Voxels are a share of the object."""
     depths = depth_maps(scan, poses)
-    size = object_size(depths)
-    unit = _UNIT_SIZE / size
-    voxel = voxel_share * _UNIT_SIZE
-    volume = o3d.pipelines.integration.ScalableTSDFVolume(
-        voxel_length=voxel,
-        sdf_trunc=_TRUNCATION_VOXELS * voxel,
-        color_type=o3d.pipelines.integration.TSDFVolumeColorType.NoColor,
-    )
+    volume = Volume(object_size(depths), voxel_share)
     for depth, T in track(zip(depths, poses.T_world_camera, strict=True), "fusing", total=len(depths)):
-        camera = depth.camera
-        intrinsic = o3d.camera.PinholeCameraIntrinsic(
-            camera.w, camera.h, camera.fl_x, camera.fl_y, camera.cx - 0.5, camera.cy - 0.5
-        )
-        scaled = T.copy()
-        scaled[:3, 3] *= unit
-        image = o3d.geometry.Image((depth.depth * unit).astype(np.float32))
-        grey = o3d.geometry.Image(np.zeros(depth.depth.shape, np.uint8))
-        rgbd = o3d.geometry.RGBDImage.create_from_color_and_depth(
-            grey, image, depth_scale=1.0, depth_trunc=1e9, convert_rgb_to_intensity=False
-        )
-        volume.integrate(rgbd, intrinsic, np.linalg.inv(scaled @ _OPENCV))
-    return largest_pieces(volume.extract_triangle_mesh(), unit)
+        volume.integrate(depth, T)
+    return volume.mesh()
 
 
 def depth_maps(scan: Scan, poses: DevicePoses) -> list[DepthMap]:

@@ -1,7 +1,11 @@
 """The classical baseline must be a fair one."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
+from benchmarks.baselines.frame_to_model import fuse_frame_to_model
 from benchmarks.baselines.poses import register
 from benchmarks.baselines.tsdf import fuse
 from sl_nerfstudio.evaluation.evaluate import score_alignments
@@ -51,3 +55,36 @@ def test_fusion_with_true_poses_is_as_good_as_its_voxels_and_registration_repair
         return found.camera.rotation_rmse_deg
 
     assert errors(registered) < 0.3 * errors(initial)
+
+
+@pytest.mark.slow
+def test_frame_to_model_fusion_recovers_the_poses_of_frames_without_noise(
+    tmp_path_factory: pytest.TempPathFactory,
+) -> None:
+    """A head without texture, frames 15 degrees apart that start a degree and 3 mm off; the first one is right."""
+    root = tmp_path_factory.mktemp("tracked") / "scan"
+    config = SynthConfig(
+        scene="head", frames=24, resolution=160, supersampling=1, noise=0.0, missing=0.0, wrong=0.0,
+        pose_error=(1.0, 3.0), autocalibration_error=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    synthesise(config, root)
+    whole = read_scan(root)
+    scan = replace(whole, frames=whole.frames[:4])
+    true = DevicePoses(*(T[:4] for T in (true_poses(whole).T_world_camera, true_poses(whole).T_world_projector)))
+    start = DevicePoses(
+        np.concatenate([true.T_world_camera[:1], scan.poses.T_world_camera[1:]]),
+        np.concatenate([true.T_world_projector[:1], scan.poses.T_world_projector[1:]]),
+    )
+    mesh, tracked = fuse_frame_to_model(scan, start, 1 / 160)
+    np.testing.assert_array_equal(tracked.T_world_camera[0], true.T_world_camera[0])
+
+    def errors(poses: DevicePoses) -> tuple[np.ndarray, np.ndarray]:
+        """Degrees, and mm at the object, of every frame that was tracked."""
+        motion = (poses.T_world_camera @ np.linalg.inv(true.T_world_camera))[1:]
+        turned = np.degrees(np.arccos(np.clip((np.trace(motion[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1)))
+        return turned, np.linalg.norm(motion[:, :3, 3], axis=1)
+
+    for least, most, before, after in zip((0.9, 2.5), (0.05, 0.06), errors(start), errors(tracked), strict=True):
+        assert before.min() > least and after.max() < most
+    surface = read_mesh(root / "ground_truth/mesh.ply")
+    assert np.percentile(IndexedMesh(surface).distance(mesh.vertices), 95) < 1.0

@@ -9,8 +9,10 @@ from typing import Any
 
 import pytest
 
+from benchmarks import paper
 from benchmarks.common.measuring import Rows, kept_rows, options, parsed, shown
 from benchmarks.launches import Config, Row
+from sl_nerfstudio.errors import UserError
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # other libraries warn freely
 
@@ -51,6 +53,36 @@ def test_rows_are_kept_from_run_to_run(tmp_path, capsys):
     assert shown(row) in capsys.readouterr().out
     assert json.loads((tmp_path / "r.json").read_text())["seed"] == 3
     assert kept_rows(tmp_path / "r.json", Row) == [row] and kept_rows(tmp_path / "none.json", Row) == []
+
+
+def test_experiments_of_the_paper_refuse_unknown_names_all_at_once(monkeypatch, rows):
+    with pytest.raises(UserError) as refused:
+        rows("paper", "table2", "--methods", "kinect", "--scenes", "bust")
+    found = str(refused.value)
+    assert "name an experiment first: table1, ablation, real, chain" in found
+    assert "--methods kinect: unknown" in found and "--scenes bust: unknown" in found and "cone-and-cylinder" in found
+
+
+def test_experiments_of_the_paper_measure_each_case_once_and_go_on_after_failures(monkeypatch, rows, capsys):
+    made, run = [], []
+
+    def measure(case, scan, folder):
+        run.append((case.method, case.variant, case.steps))
+        if case.method == "registered":
+            raise SystemExit("sl-eval\nno surface")
+        return paper.Errors(1, 2, 3, 4, 5, 6, 7)
+
+    monkeypatch.setattr(paper, "make", lambda case, scan: (scan.mkdir(), made.append(case.decoding)))
+    monkeypatch.setattr(paper, "measure", measure)
+    words = ("real", "--scenes", "frog", "--decoding", "usual", "90% missing", "--steps", 30)
+    for _ in range(2):
+        found = rows("paper", *words)
+    assert made == ["usual", "90% missing"]
+    methods = [("tracked", 0), ("registered", 0), ("sl-neus", 1000), ("sl-neus-paper", 30)]
+    assert run == [(method, "refined", steps) for method, steps in methods] * 2
+    assert [row["errors"] is None for row in found] == [False, True, False, False] * 2
+    assert found[0]["case"]["frames"] == 57 and found[1]["fault"] == "sl-eval\nno surface"
+    assert "failed: no surface" in capsys.readouterr().out
 
 
 @pytest.mark.slow
