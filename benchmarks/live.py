@@ -32,7 +32,7 @@ from sl_nerfstudio.live.sources import CameraSource
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.scan import read_scan
-from sl_nerfstudio.scan.write import device_fields, encode_json
+from sl_nerfstudio.scan.write import encode_intrinsics
 from sl_nerfstudio.storage import write_atomic
 from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
 from sl_nerfstudio.synthesis.config import SynthConfig
@@ -153,9 +153,7 @@ class Stage:
 
     def intrinsics(self) -> bytes:
         """The file with the intrinsics of both devices."""
-        camera, projector = self.devices.camera, self.devices.projector
-        own = {**device_fields(projector, "model"), "pattern_path": "pattern.png"}
-        return encode_json({"units": "mm", **device_fields(camera, "camera_model"), "projector": own})
+        return encode_intrinsics("mm", self.devices.camera, self.devices.projector)
 
 
 def record(folder: Path, scene: str, steps: Sequence[Step], seed: int) -> Recording:

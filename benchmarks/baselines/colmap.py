@@ -10,10 +10,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.runs.cameras import Y_Z_DOWN
 
 Cameras = Mapping[str, Float64[ndarray, "4 4"]]
 """Poses of cameras, camera to world, by the names of their images."""
-_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # COLMAP's camera axes to ours, on the right
 
 
 def structure_from_motion(images: Path, camera: Device, work: Path) -> Cameras:
@@ -45,4 +45,4 @@ def structure_from_motion(images: Path, camera: Device, work: Path) -> Cameras:
 
 def camera_pose(T_camera_world: Float64[ndarray, "3 4"]) -> Float64[ndarray, "4 4"]:
     """Pose in our axes, camera to world, of what COLMAP gives."""
-    return np.linalg.inv(np.vstack([T_camera_world, [0.0, 0.0, 0.0, 1.0]])) @ _OPENCV
+    return np.linalg.inv(np.vstack([T_camera_world, [0.0, 0.0, 0.0, 1.0]])) @ Y_Z_DOWN

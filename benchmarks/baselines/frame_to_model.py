@@ -11,11 +11,12 @@ import open3d as o3d
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.baselines.tsdf import OPENCV, UNIT_SIZE, DepthMap, Volume, depth_maps, object_size
+from benchmarks.baselines.tsdf import UNIT_SIZE, DepthMap, Volume, depth_maps, object_size
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.runs.cameras import Y_Z_DOWN
 from sl_nerfstudio.scan import Scan
 
 _GATES = (0.08, 0.03, 0.015)  # of the object's size: depths that differ by more do not correspond; one rendering each
@@ -45,7 +46,7 @@ def _tracked(volume: Volume, depth: DepthMap, T_world_camera: Float[ndarray, "4 
     matrix, frame = o3d.core.Tensor(_matrix(depth.camera, 0.0)), _image(depth.depth * volume.unit)
     criteria = [odometry.OdometryConvergenceCriteria(n) for n in _ITERATIONS]
     method = odometry.Method.PointToPlane
-    T = T_world_camera @ OPENCV
+    T = T_world_camera @ Y_Z_DOWN
     T[:3, 3] *= volume.unit
     for gate in _GATES:
         seen = _image(_seen(scene, depth.camera, T))
@@ -58,7 +59,7 @@ def _tracked(volume: Volume, depth: DepthMap, T_world_camera: Float[ndarray, "4 
             return None
         T = T @ found.transformation.numpy()
     T[:3, 3] /= volume.unit
-    return T @ OPENCV
+    return T @ Y_Z_DOWN
 
 
 def _seen(scene: o3d.t.geometry.RaycastingScene, camera: Device, T: Float[ndarray, "4 4"]) -> Float[ndarray, "h w"]:

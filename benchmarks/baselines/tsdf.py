@@ -16,6 +16,7 @@ from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.triangulation import pixel_centres, triangulate
 from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.runs.cameras import Y_Z_DOWN
 from sl_nerfstudio.scan import Frame, Scan
 
 _LEAST_REGION = 0.01  # of the frame's known pixels; smaller islands of depth are wrong decodings
@@ -83,7 +84,6 @@ def _undistorted(depth: Float[ndarray, "h w"], camera: Device) -> DepthMap:
     return DepthMap(out, pinhole)
 
 
-OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's camera axes to OpenCV's, on the right
 _TRUNCATION_VOXELS = 5.0
 _LEAST_PIECE = 0.02  # of the largest connected piece's triangles; smaller pieces are dropped
 UNIT_SIZE = 100.0  # the object is scaled to about this size: Open3D's defaults assume it
@@ -115,7 +115,7 @@ class Volume:
         rgbd = o3d.geometry.RGBDImage.create_from_color_and_depth(
             grey, image, depth_scale=1.0, depth_trunc=1e9, convert_rgb_to_intensity=False
         )
-        self._tsdf.integrate(rgbd, intrinsic, np.linalg.inv(scaled @ OPENCV))
+        self._tsdf.integrate(rgbd, intrinsic, np.linalg.inv(scaled @ Y_Z_DOWN))
 
     def surface(self) -> o3d.geometry.TriangleMesh:
         """All of the surface, scaled."""

@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float64
@@ -21,7 +21,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.scan.types import Scale
-from sl_nerfstudio.scan.write import ScanWriter, device_fields, encode_json
+from sl_nerfstudio.scan.write import ScanWriter, encode_intrinsics, encode_json
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import DISTANCE, make_devices, make_paths
 from sl_nerfstudio.synthesis.render import (
@@ -148,12 +148,7 @@ def _render(one: PhotographSet, frames: int, resolution: int, quality: Quality, 
                 truth.add_file(f"{part}.ply", encode_ply(mesh.vertices, mesh.faces))
     (root / "pattern.png").write_bytes(encode_png(np.rint(255 * pattern).astype(np.uint8)))
     (root / "pattern.json").write_bytes(PATTERN.encode())
-    intrinsics: dict[str, Any] = {
-        "units": "mm",
-        **device_fields(devices.camera, "camera_model"),
-        "projector": {**device_fields(devices.projector, "model"), "pattern_path": "pattern.png"},
-    }
-    (root / "intrinsics.json").write_text(json.dumps(intrinsics, indent=1) + "\n")
+    (root / "intrinsics.json").write_bytes(encode_intrinsics("mm", devices.camera, devices.projector))
     note = {"unordered": False, "appearance": f"{one.matter} by {one.camera}",
             "frames": {name: k for k, name in enumerate(names)}}  # fmt: skip
     (root / SET).write_text(json.dumps(note, indent=1) + "\n")

@@ -37,6 +37,8 @@ def quiet_nerfstudio(quiet: bool) -> None:
 # With which settings a run was made: a hash that its config.yml and its checkpoints carry.
 
 _WITHOUT_EFFECT = {"eval_num_rays_per_chunk", "prompt"}  # settings of the model that do not change its result
+POSE_OPTIMIZERS = ("camera_optimizer", "projector_optimizer")
+"""Settings of the model that earlier runs lack: left out, they say what those runs did."""
 
 
 def settings_fingerprint(config: Any) -> str:
@@ -50,7 +52,7 @@ def decisive_settings(config: Any) -> dict[str, Any]:
     The number of steps is left out, too: training can go on.
     """
     model = {name: value for name, value in plain(config.pipeline.model).items() if name not in _WITHOUT_EFFECT}
-    for name in ("camera_optimizer", "projector_optimizer"):  # left out, they say what runs before them did
+    for name in POSE_OPTIMIZERS:
         if model[name] == {"mode": None}:
             del model[name]
     return {

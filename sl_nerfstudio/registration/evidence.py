@@ -725,6 +725,12 @@ class _Kept:
     noise: tuple[float, float] = (np.nan, np.nan)
     scaled: Compared | None = None
 
+    def in_units(self, noise: tuple[float, float], pair: PairEvidence) -> Compared:
+        """In units of the noise of both frames."""
+        if self.scaled is None or self.noise != noise:
+            self.noise, self.scaled = noise, pair.scaled(self.compared, noise)
+        return self.scaled
+
 
 class KeptResiduals:
     """Residuals of pairs of frames at the most likely place close to each place that was asked for.
@@ -755,13 +761,7 @@ class KeptResiduals:
             self._count += len(new)
             following = iter(rows)
             known = [next(following) if one is None else one for one in known]
-        found: list[Compared] = []
-        for one in known:
-            assert one is not None
-            if one.scaled is None or one.noise != noise:
-                one.noise, one.scaled = noise, pair.scaled(one.compared, noise)
-            found.append(one.scaled)
-        return found
+        return [one.in_units(noise, pair) for one in known if one is not None]
 
     @staticmethod
     def _likeliest_near(a: FrameEvidence, b: FrameEvidence, start: Places) -> Places:

@@ -21,7 +21,13 @@ from sl_nerfstudio.model.model import SLModelConfig
 from sl_nerfstudio.model.optimisers import DecaySchedulerConfig, FusedAdamOptimizerConfig, RowAdamOptimizerConfig
 from sl_nerfstudio.model.outputs import TrainedModel
 from sl_nerfstudio.model.pipeline import SLPipeline, SLPipelineConfig, require_together
-from sl_nerfstudio.model.run_files import Checkpoint, checkpoints_in, read_checkpoint, settings_fingerprint
+from sl_nerfstudio.model.run_files import (
+    POSE_OPTIMIZERS,
+    Checkpoint,
+    checkpoints_in,
+    read_checkpoint,
+    settings_fingerprint,
+)
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from sl_nerfstudio.parallel import DeviceName, usable_device
 from sl_nerfstudio.scan import read_scan
@@ -33,7 +39,6 @@ from sl_nerfstudio.scan import read_scan
 
 _MOST_BYTES = 1 << 20  # a configuration has some ten thousand
 _PYTHON = "tag:yaml.org,2002:python/"
-_LATER = ("camera_optimizer", "projector_optimizer")  # settings that runs before them lack: their defaults say the same
 
 
 def read_config(path: Path) -> SLTrainerConfig:
@@ -161,7 +166,7 @@ class _ConfigLoader(yaml.SafeLoader):
                 raise _NotExpected(key, f"{kind.__name__} has no setting {key.value!r}", earlier=_is_ours(name))
             if not _fits(values[key.value], hints[key.value]):
                 raise _NotExpected(item, f"{values[key.value]!r:.100} is no value for {kind.__name__}.{key.value}")
-        missing = [name for name in names if name not in values and name not in _LATER]
+        missing = [name for name in names if name not in values and name not in POSE_OPTIMIZERS]
         if missing:
             raise _NotExpected(node, f"{kind.__name__} lacks the setting {missing[0]!r}")
         made = object.__new__(kind)

@@ -230,6 +230,12 @@ def encode_json(document: dict[str, Any]) -> bytes:
     return (json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
+def encode_intrinsics(units: str, camera: Device, projector: Device) -> bytes:
+    """An intrinsics.json of both devices, beside which the pattern is `pattern.png`."""
+    own = {**device_fields(projector, "model"), "pattern_path": "pattern.png"}
+    return encode_json({"units": units, **device_fields(camera, "camera_model"), "projector": own})
+
+
 # A copy of a scan folder, with coordinates as arrays.
 
 

@@ -1,6 +1,5 @@
 """Synthesis from a configuration to files: a few frames at a time are rendered, disturbed and written."""
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -21,7 +20,7 @@ from sl_nerfstudio.pattern.grid import GridPattern, normalise_locally
 from sl_nerfstudio.pattern.layout import Lattice, PatternLayout
 from sl_nerfstudio.scan.images import as_grey, encode_png
 from sl_nerfstudio.scan.types import PoseSigma, Scale
-from sl_nerfstudio.scan.write import ScanWriter, device_fields, encode_json, sigma_fields
+from sl_nerfstudio.scan.write import ScanWriter, encode_intrinsics, encode_json, sigma_fields
 from sl_nerfstudio.storage import NewFolder
 from sl_nerfstudio.synthesis.appearance import RANGES, Appearance, Look, make_appearance, make_look
 from sl_nerfstudio.synthesis.config import MILLIMETRES, SynthConfig
@@ -398,9 +397,5 @@ def _write_captures(config: SynthConfig, setup: Setup, folder: NewFolder) -> Non
     folder.write("pattern.png", encode_png(_to_8_bit(setup.pattern)))
     if setup.layout is not None:
         folder.write("pattern.json", setup.layout.encode())
-    intrinsics = {
-        "units": config.units,
-        **device_fields(setup.devices.camera, "camera_model"),
-        "projector": {**device_fields(setup.devices.projector, "model"), "pattern_path": "pattern.png"},
-    }
-    folder.write("intrinsics.json", (json.dumps(intrinsics, indent=1) + "\n").encode(), last=True)
+    intrinsics = encode_intrinsics(config.units, setup.devices.camera, setup.devices.projector)
+    folder.write("intrinsics.json", intrinsics, last=True)
