@@ -205,6 +205,7 @@ def _c_library() -> ctypes.CDLL:
 # torch's own. Callers may be several threads (training, viewer) at once.
 
 T = TypeVar("T")
+U = TypeVar("U")
 
 if torch.get_num_threads() > cores():  # torch does not know of quotas
     torch.set_num_threads(cores())
@@ -295,6 +296,14 @@ def results(tasks: Sequence[Callable[[], T]]) -> list[T]:
 
     parallel([partial(keep, k) for k in range(len(tasks))])
     return [found[k] for k in range(len(tasks))]
+
+
+def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
+    """What two tasks return; they run as in `parallel`."""
+    a: list[T] = []
+    b: list[U] = []
+    parallel([lambda: a.append(first()), lambda: b.append(second())])
+    return a[0], b[0]
 
 
 def _work(tasks: Sequence[Callable[[], object]], queue: Iterator[int], many: bool) -> None:

@@ -65,17 +65,18 @@ class NodeRecogniser:
         with torch.inference_mode():
             around = torch.from_numpy(self._turned.around.astype(np.int64))
             self._features = self._network(one_hot(self._turned.symbol), around)
+            self._candidates = [self._features[torch.from_numpy(self._turned.turn == turn)] for turn in range(4)]
 
     def assign(self, graph: GridGraph) -> Assignment:
         """The place in the pattern of every node of a graph."""
         features = self._features_of(graph)
-        turn = choose_turn(self._best_by_turn(features))
+        best, total = self._best_by_turn(features)
+        turn = choose_turn(best)
         codes = rotate_codes(self.codes, turn)
         place = np.full((len(graph.place), 2), -1, dtype=np.int32)
         for index in _batches(graph.neighbour):
-            log_probability = torch.log_softmax(self._logits(features[index]), dim=1).numpy()
-            own = log_probability[:, self._turned.turn == turn].reshape(-1, *codes.shape)
-            place[index] = believe(own, graph.part(index).neighbour)
+            own = self._logits(features[index], self._candidates[turn]).numpy() - total[index, None]
+            place[index] = believe(own.reshape(-1, *codes.shape), graph.part(index).neighbour)
         return Assignment(turn, agree(place, graph, codes))
 
     def logits(self, graph: GridGraph) -> Float[Tensor, "n m"]:
@@ -83,25 +84,29 @@ class NodeRecogniser:
 
         Candidates are in the order of `turned_pattern`.
         """
-        return self._logits(self._features_of(graph))
+        return self._logits(self._features_of(graph), self._features)
 
     def _features_of(self, graph: GridGraph) -> Float[Tensor, "n features"]:
         around = torch.from_numpy(neighbourhoods(graph.neighbour).astype(np.int64))
         with torch.inference_mode():
             return self._network(torch.from_numpy(graph.score), around)
 
-    def _logits(self, features: Float[Tensor, "k features"]) -> Float[Tensor, "k m"]:
+    def _logits(self, features: Float[Tensor, "k features"], candidates: Float[Tensor, "m features"]) -> Tensor:
         with torch.inference_mode():
-            return self._network.logits(features, self._features)
+            return self._network.logits(features, candidates)
 
-    def _best_by_turn(self, features: Float[Tensor, "n features"]) -> Float32[ndarray, "n 4"]:
-        """The highest log probability of each node in each quarter turn."""
-        best = np.empty((len(features), 4), dtype=np.float32)
+    def _best_by_turn(
+        self, features: Float[Tensor, "n features"]
+    ) -> tuple[Float32[ndarray, "n 4"], Float32[ndarray, "n"]]:
+        """The highest log probability of each node in each quarter turn, and the logarithm of its odds' sum."""
+        best, total = (np.empty((len(features), 4), dtype=np.float32) for _ in range(2))
         for start in range(0, len(features), _BATCH):
-            part = torch.log_softmax(self._logits(features[start : start + _BATCH]), dim=1).numpy()
-            for turn in range(4):
-                best[start : start + _BATCH, turn] = part[:, self._turned.turn == turn].max(-1)
-        return best
+            part = slice(start, start + _BATCH)
+            for turn, candidates in enumerate(self._candidates):
+                logits = self._logits(features[part], candidates)
+                best[part, turn], total[part, turn] = logits.amax(1).numpy(), torch.logsumexp(logits, 1).numpy()
+        every = np.logaddexp.reduce(total, axis=1)
+        return best - every[:, None], every
 
 
 def _batches(neighbour: Int32[ndarray, "n 4"]) -> Iterator[Int32[ndarray, "k"]]:

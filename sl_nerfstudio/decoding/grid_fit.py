@@ -7,6 +7,7 @@ the phases of the network only have to be roughly right.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -15,7 +16,7 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoder import large_regions
-from sl_nerfstudio.parallel import compiled
+from sl_nerfstudio.parallel import compiled, parallel, results
 
 # Gaussian means and local planes for images with unknown parts.
 
@@ -30,8 +31,11 @@ def gaussian_means(layers: Float32[ndarray, "k h w 4"], sigma: float) -> Float32
     radius = int(np.ceil(_REACH * sigma))
     size = (2 * radius + 1, 2 * radius + 1)
     out = np.empty_like(layers)
-    for group, means in zip(layers, out, strict=True):
-        cv2.GaussianBlur(group, size, sigma, dst=means, borderType=cv2.BORDER_CONSTANT)
+
+    def blur(k: int) -> None:
+        cv2.GaussianBlur(layers[k], size, sigma, dst=out[k], borderType=cv2.BORDER_CONSTANT)
+
+    parallel([partial(blur, k) for k in range(len(layers))])
     return out
 
 
@@ -368,7 +372,7 @@ def _refine(
     period = grids[0].period
     coords = _smooth(coords, inside, pixels_a_period, period)
     start, even = coords, GridLight.even(image.shape)
-    fits = [fit_shift(image, coords, trust, grid, even, pixels_a_period, _WINDOW) for grid in grids]
+    fits = results([partial(fit_shift, image, coords, trust, grid, even, pixels_a_period, _WINDOW) for grid in grids])
     best = int(np.argmax([fit.agreement[inside].mean() for fit in fits]))
     shift, light = fits[best].shift, measure_light(image, coords, trust, grids[best], pixels_a_period)
     for index in range(_ROUNDS):

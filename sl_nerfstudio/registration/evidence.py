@@ -22,7 +22,8 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of
 from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.parallel import compiled, compiled_range
+from sl_nerfstudio.geometry.numerics import quantile
+from sl_nerfstudio.parallel import both, compiled, compiled_range
 from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, HIDDEN_DEPTH, LEAST_LIT_COSINE, Hypotheses, lit
 from sl_nerfstudio.registration.surfaces import (
     EmptyPlaces,
@@ -118,7 +119,7 @@ class Frame:
     @staticmethod
     def of(cloud: FrameCloud) -> "Frame":
         """Build both from a cloud."""
-        return Frame(build_surface_map(cloud), frame_evidence(cloud))
+        return Frame(*both(lambda: build_surface_map(cloud), lambda: frame_evidence(cloud)))
 
 
 def frame_evidence(cloud: FrameCloud) -> FrameEvidence:
@@ -691,7 +692,7 @@ class PairEvidence:
             for g in range(len(SPREADS) + 1):
                 here = judged[k] & (group[k] == g)
                 if here.sum() >= FEWEST_JUDGED:
-                    own = np.quantile(np.abs(z[k][here]), NOISE_QUANTILES[0]) / NOISE_RESIDUALS[0]
+                    own = quantile(np.abs(z[k][here]), NOISE_QUANTILES[0]) / NOISE_RESIDUALS[0]
                     z[k][here] /= np.clip(own, 1 / LARGEST_SHARED, LARGEST_SHARED)
         return Compared(z, found.codes, found.spread, INDISTINCT_SIGMAS)
 

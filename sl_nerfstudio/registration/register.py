@@ -278,7 +278,7 @@ def include_left_out(
 
     `clouds` have the adjusted relative poses; poses of frames that are not registered are NaN.
     """
-    graph = ViewGraph([Frame.of(c) for c in clouds], {}, np.random.default_rng(seed))
+    graph = ViewGraph(results([partial(Frame.of, c) for c in clouds]), {}, np.random.default_rng(seed))
     main: Component = {
         k: Similarity(float(adjusted.baseline[k]), T[:3, :3], T[:3, 3])
         for k, T in enumerate(adjusted.T_world_camera)
