@@ -27,8 +27,8 @@ from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_relative_pose
 from sl_nerfstudio.scan.images import as_grey
 
-PERIOD = 8.5  # pixels of the grid at which images are decoded
-PERIOD_REACH = 1.2  # factor by which it may depart from that before the size is changed
+PERIOD = 7.8  # pixels of the grid at which images are decoded
+PERIOD_REACH = 1.12  # factor by which it may depart from that before the size is changed
 LARGEST_SIDE = 960  # pixels of the longer side at which the grid is looked for, as long as its period is not known
 LATTICE = 320  # pixels of the longer side, about, on which a frame is placed
 RAYS = RayCounts(fit=16000, polishing=300, ranking=1500)  # by which the relative pose is found
