@@ -173,7 +173,17 @@ def stages(case: Case, photographs: bool, until: str, before: Path | None) -> di
     found: dict[str, Callable[[], list[Row]]] = {}
     if photographs:
         found["sl-synth --images-only"] = lambda: [
-            case.command("sl-synth --images-only", images, "sl-synth", "--output", images, "--images-only", *synth)
+            case.command(
+                "sl-synth --images-only",
+                images,
+                "sl-synth",
+                "--output",
+                images,
+                "--images-only",
+                "--background",
+                "table",
+                *synth,
+            )
         ]
         if before is not None:
             found["sl-process, before"] = lambda: process("sl-process, before", before)
