@@ -38,7 +38,6 @@ _TURNING = 0.9  # of the samples: axes that turn as the camera's
 
 Grid = Float32[ndarray, "n h w"]
 Lit = Bool[ndarray, "h w"]
-OnLines = Bool[ndarray, "m"]
 Values = Int64[ndarray, "h w"] | Float64[ndarray, "h w"]
 
 

@@ -52,10 +52,6 @@ class NormalEquations:
         weighted = J if weight is None else J * weight[:, None]
         return NormalEquations(weighted.T @ J, weighted.T @ r)
 
-    def with_prior(self, offset: Float64[ndarray, "n"], information: Float64[ndarray, "n n"]) -> "NormalEquations":
-        """Add a Gaussian prior whose mean lies at `-offset` from the state."""
-        return NormalEquations(self.H + information, self.g + information @ offset)
-
     def step(self, damping: float) -> Float64[ndarray, "n"]:
         """The increment that minimises the damped quadratic model; zero along undetermined directions."""
         return -_solve_scaled(self.H + damping * np.diag(np.diag(self.H)), self.g)

@@ -338,15 +338,6 @@ def exps_at(
     return Similarities(scale, R, centre - turned + radius[:, None] * x[:, :3])
 
 
-# Increments (v, w, l) of similarities about a pivot c: `p -> c + exp(l) exp(w) (p - c) + radius v`.
-
-
-def log_at(D: Similarity, centre: Float64[ndarray, "3"], radius: float) -> Float64[ndarray, "7"]:
-    """Increment (v, w, l) about a pivot that is the similarity D."""
-    v = (D.points(centre[None])[0] - centre) / radius
-    return np.concatenate([v, Rotation.from_matrix(D.R).as_rotvec(), [np.log(D.scale)]])
-
-
 # Rigid motions of single points, for compiled loops.
 
 

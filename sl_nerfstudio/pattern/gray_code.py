@@ -106,13 +106,6 @@ class GrayCode(PatternLayout):
         found = {(item.steps, item.period) for item in self.shown if item.what == "phase" and item.axis == axis}
         return sorted(found, key=lambda sine: -sine[1])
 
-    def even_images(self) -> list[int]:
-        """Index of the images whose mean shows no stripes: pairs of a bit and its inverse, white, or all sines."""
-        pairs = [pair for axis in (0, 1) for pair in self.bit_images(axis)]
-        with_inverse = [place for direct, inverse in pairs if inverse is not None for place in (direct, inverse)]
-        white = self.place(ShownImage("white"))
-        return with_inverse or (list(range(self.images)) if white is None else [white])
-
     def sine_images(self, axis: int, steps: int, period: float) -> list[int]:
         """Index in the sequence of every shift of a sine."""
         return [self.shown.index(ShownImage("phase", axis, k, False, steps, period)) for k in range(steps)]

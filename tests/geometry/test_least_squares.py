@@ -65,15 +65,6 @@ def test_covariance_is_the_scatter_of_estimates():
     np.testing.assert_allclose(scatter / sigmas, stated / sigmas, atol=0.1)
 
 
-def test_a_prior_is_the_same_as_residuals_that_state_it():
-    rng = np.random.default_rng(2)
-    J, r, A, offset = rng.normal(size=(9, 4)), rng.normal(size=9), rng.normal(size=(4, 4)), rng.normal(size=4)
-    plain = NormalEquations.of(np.vstack([J, A]), np.concatenate([r, A @ offset]))
-    prior = NormalEquations.of(J, r).with_prior(offset, A.T @ A)
-    np.testing.assert_allclose(prior.H, plain.H)
-    np.testing.assert_allclose(prior.g, plain.g)
-
-
 def test_undetermined_directions_are_not_moved_along():
     J = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 0.0]])
     equations = NormalEquations.of(J, np.array([1.0, 2.0]))
