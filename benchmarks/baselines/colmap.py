@@ -9,8 +9,7 @@ import pycolmap
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.runs.cameras import Y_Z_DOWN
+from sl_nerfstudio.geometry.devices import Y_Z_DOWN, Device
 
 Cameras = Mapping[str, Float64[ndarray, "4 4"]]
 """Poses of cameras, camera to world, by the names of their images."""

@@ -13,10 +13,9 @@ from numpy import ndarray
 
 from benchmarks.baselines.tsdf import UNIT_SIZE, DepthMap, Volume, depth_maps, object_size
 from sl_nerfstudio.console import track
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.devices import Y_Z_DOWN, Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.runs.cameras import Y_Z_DOWN
 from sl_nerfstudio.scan import Scan
 
 _GATES = (0.08, 0.03, 0.015)  # of the object's size: depths that differ by more do not correspond; one rendering each

@@ -12,11 +12,10 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from sl_nerfstudio.console import track
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
+from sl_nerfstudio.geometry.devices import Y_Z_DOWN, Device, Intrinsics, project
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.triangulation import pixel_centres, triangulate
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.runs.cameras import Y_Z_DOWN
 from sl_nerfstudio.scan import Frame, Scan
 
 _LEAST_REGION = 0.01  # of the frame's known pixels; smaller islands of depth are wrong decodings

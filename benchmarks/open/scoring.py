@@ -14,13 +14,13 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.evaluate import score_alignments
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import MeshReference, compare_poses, mesh_reference
+from sl_nerfstudio.geometry.devices import Y_Z_DOWN
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
 from sl_nerfstudio.scan.document import TRANSFORMS, frame_label, read_document
 
 CAMERAS_TUM, PROJECTORS_TUM = "cameras.txt", "projectors.txt"
-_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # its device axes to ours, on the right
 _ORTHOGONAL = 1e-3  # largest departure of R R^T from the identity
 
 
@@ -69,7 +69,7 @@ def _of_tum(path: Path) -> dict[str, Float64[ndarray, "4 4"]]:
                 f"{path}: line {number}: is not NAME TX TY TZ QX QY QZ QW\n"
                 "    remedy: one line for each frame: its name, the position, and a quaternion other than 0"
             ) from error
-        found[words[0]] = T @ _OPENCV
+        found[words[0]] = T @ Y_Z_DOWN
     return found
 
 

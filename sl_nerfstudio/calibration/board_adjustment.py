@@ -20,6 +20,7 @@ from sl_nerfstudio.calibration.formats import lens_slopes
 from sl_nerfstudio.geometry.devices import (
     MODELS,
     PARAMETERS,
+    Y_Z_DOWN,
     Device,
     DeviceKind,
     Intrinsics,
@@ -43,7 +44,6 @@ _ASPECTS = (1.0, 0.5, 0.7, 1.4, 2.0)  # fl_y over fl_x: pixels need not be squar
 _SQUARE = 2.0  # noise with square pixels, relative to that with two focal lengths: up to here they are taken as square
 _CENTRES = (0.5, 1.0, 0.0, 1.3, -0.3)  # principal point of a projector, in heights of the pattern: lens shift
 _TRIED = 3  # of the starts that fit best, how many are adjusted
-_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # between OpenCV's device axes and ours
 _LEAST_CORNERS = 6
 Size = tuple[int, int]
 
@@ -405,7 +405,7 @@ def _pose(device: Device, points: Float64[ndarray, "m 3"], corners: Corners) -> 
     T = np.eye(4)
     T[:3, :3] = cv2.Rodrigues(rotation)[0]
     T[:3, 3] = shift[:, 0] - T[:3, :3] @ middle
-    return _AXES @ T, float(((again - uv) ** 2).sum())
+    return Y_Z_DOWN @ T, float(((again - uv) ** 2).sum())
 
 
 def _seen_by_projector(

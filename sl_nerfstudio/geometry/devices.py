@@ -13,6 +13,11 @@ from torch import Tensor
 
 from sl_nerfstudio.parallel import compiled
 
+# Axes of a device.
+
+Y_Z_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Between device axes of computer vision (+y down, looking along +z) and ours (+y up, looking along -z)."""
+
 # Intrinsics of one device, and of a batch of devices as a tensor.
 
 DeviceKind = Literal["OPENCV", "DOE"]

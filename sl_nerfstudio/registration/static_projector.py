@@ -15,7 +15,7 @@ from scipy.linalg import rq
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtri
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, project_jacobian
+from sl_nerfstudio.geometry.devices import Y_Z_DOWN, Device, Intrinsics, project, project_jacobian
 from sl_nerfstudio.geometry.least_squares import BlockEquations, minimise
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import one_library_thread
@@ -220,8 +220,6 @@ def _sums(cell: Int64[ndarray, "n"], values: Float64[ndarray, "n *k"], cells: in
 # Cameras placed by the codes alone: two views first, then one camera after the other against the known points.
 # Normalised coordinates are OpenCV's here (y down, looking along +z); poses are those of the devices (along -z).
 
-FLIP = np.diag([1.0, -1.0, -1.0])  # between the axes of OpenCV and those of the devices
-
 
 def image_points(d: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
     """Normalised coordinates of rays, y down."""
@@ -231,7 +229,7 @@ def image_points(d: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
 def pose_from_opencv(R: Float64[ndarray, "3 3"], t: Float64[ndarray, "3"]) -> Float64[ndarray, "4 4"]:
     """T_world_device from OpenCV's R, t, which map points of the world to the device."""
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R.T @ FLIP, -R.T @ t
+    T[:3, :3], T[:3, 3] = R.T @ Y_Z_DOWN[:3, :3], -R.T @ t
     return T
 
 
@@ -273,7 +271,7 @@ def _two_views(
         return None
     T = pose_from_opencv(R, t[:, 0])
     # the first camera's own axes are the world's: from OpenCV's to the device's
-    T[:3] = FLIP @ T[:3]
+    T[:3] = Y_Z_DOWN[:3, :3] @ T[:3]
     return T, mask[:, 0] > 0
 
 

@@ -16,7 +16,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.devices import Y_Z_DOWN, Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.numerics import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import world_pixels
@@ -25,9 +25,6 @@ from sl_nerfstudio.meshing.uncertainty import views_by_frame
 from sl_nerfstudio.scan.types import Scan
 
 # Cameras and projectors with their poses, in the unit and the axes of other programs.
-
-Y_Z_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From device axes of computer vision (+y down, looking along +z) to those of a scan (+y up, looking along -z)."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.devices import Y_Z_DOWN, Device
 from sl_nerfstudio.scan.check_geometry import Correspondences, GeometricFit, OtherClouds, fit_geometry
 from sl_nerfstudio.scan.check_mixed_poses import SUSPECT, SUSPECT_SIGMAS, copied_poses, is_suspect, mixed_poses
 from sl_nerfstudio.scan.document import Problem
@@ -23,7 +23,6 @@ from sl_nerfstudio.scan.document import Problem
 
 PoseConvention = Literal["as given", "inverted", "OpenCV axes", "inverted, OpenCV axes"]
 POSE_CONVENTIONS: tuple[PoseConvention, ...] = ("as given", "inverted", "OpenCV axes", "inverted, OpenCV axes")
-_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])  # device axes of OpenCV <-> of this format
 
 
 @dataclass(frozen=True)
@@ -79,7 +78,7 @@ def apply_interpretation(interpretation: Interpretation, frame: Correspondences,
 
 def _converted_pose(T: Float64[ndarray, "4 4"], convention: PoseConvention) -> Float64[ndarray, "4 4"]:
     out = np.linalg.inv(T) if convention.startswith("inverted") else T
-    return out @ _OPENCV if convention.endswith("OpenCV axes") else out
+    return out @ Y_Z_DOWN if convention.endswith("OpenCV axes") else out
 
 
 def converted_coords(uv: Float[ndarray, "n 2"], how: Interpretation, size: tuple[int, int]) -> Float[ndarray, "n 2"]:
