@@ -25,7 +25,6 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     free_parameters,
     linearise_with_intrinsics,
     prior_equations,
-    with_smooth_derivatives,
 )
 from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Rig, linearise, residuals_of
@@ -112,8 +111,7 @@ def _result(explored: Explored, before: float) -> Adjustment:
     kernel = kernel_of(state, found.rows, found.widths, r)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
     extended = linearise_with_intrinsics(linear, state.rig, state.anchors, found.rows, maps)
-    smooth = with_smooth_derivatives(extended, state.rig, state.anchors, found.rows, maps)
-    evidence = CovarianceEvidence(state.rig, state.anchors, found.rows, extended, smooth, kernel)
+    evidence = CovarianceEvidence(state.rig, state.anchors, found.rows, extended, kernel)
     free = free_parameters(explored.refine, state.rig)
     factor, intrinsics = pose_covariance(evidence, free, problem.start, problem.prior, found.noise)
     return Adjustment(

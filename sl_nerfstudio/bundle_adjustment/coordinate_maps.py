@@ -8,7 +8,7 @@ the adjustment would turn that offset into wrong poses.)
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 
 import numpy as np
@@ -22,8 +22,7 @@ from sl_nerfstudio.parallel import compiled, compiled_range, results
 from sl_nerfstudio.storage import GrowingArray, largest_in_memory
 
 HALF_WINDOW = 3  # camera pixels to each side of the window in which a paraboloid is fitted
-WIDE_HALF_WINDOW = 12  # for derivatives that say how much residuals know: about a period of the pattern, within which
-# errors of coordinates are shared; derivatives of smaller windows are noisy, which looks like information
+_NORMAL_HALF_WINDOW = 6  # the same for normals of the surface
 _LEAST_PIXELS = 24  # decoded pixels that a window of HALF_WINDOW must hold
 _LEAST_PIVOT = 1e-3  # share of a pivot that elimination must leave; below it the window's pixels lie on a conic
 _ROUGHNESS_PX = 2.0  # RMS distance of a window from its paraboloid, pattern pixels: beyond, the map is discontinuous
@@ -428,6 +427,11 @@ class CoordinateMaps:
         found = roughness[torch.isfinite(roughness)]
         usual = float(found.median()) if len(found) else 0.0
         return replace(maps, max_roughness=max(_ROUGHNESS_PX, _ROUGHNESS_MEDIANS * usual))
+
+    @cached_property
+    def for_normals(self) -> "CoordinateMaps":
+        """The same images with wider windows: slopes of small ones are noisy."""
+        return self.with_windows(_NORMAL_HALF_WINDOW)
 
     @property
     def frames(self) -> int:

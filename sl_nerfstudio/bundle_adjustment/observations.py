@@ -1,6 +1,6 @@
 """Which decoded pixels take part in the bundle adjustment, and in which other frames they are looked up."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -12,6 +12,7 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import (
     CoordinateMaps,
     Groups,
+    MapSample,
     mixed,
     place_of,
     seed_from,
@@ -19,8 +20,8 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import (
     words_of,
 )
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Residuals, Rig, array, pixels_of_rows
-from sl_nerfstudio.geometry.devices import unproject, view_of
-from sl_nerfstudio.geometry.lie import moved, rotate, transform
+from sl_nerfstudio.geometry.devices import project, unproject, view_of
+from sl_nerfstudio.geometry.lie import inverse, moved, rotate, transform
 from sl_nerfstudio.geometry.numerics import (
     MAD_TO_SIGMA,
     geman_mcclure_cost,
@@ -34,6 +35,8 @@ _ENTRIES_AT_ONCE = 2**28  # pairs of an anchor and a frame: bounds memory, to a 
 _TRIED_ANCHORS = 24  # of each frame, that show which frames see the same surface
 _LEAST_SHARED = 2  # of those, both ways, for two frames to be partners
 
+_STEP = 1e-3  # pixels, of differences that give normals
+_LEAST_ALIKE = 0.7  # cosine between normals at the same place
 NOISE_FLOOR_PX = 0.01  # smallest plausible noise of one look-up, pattern pixels
 _FASTEST = 1.4  # largest factor by which a kernel narrows in one step
 _OBLIQUENESS_CLASSES = 8  # of look-ups, by the cosine at which the camera sees the surface; each has its own noise
@@ -139,15 +142,45 @@ def anchors_at(
 ) -> tuple[Anchors, Bool[Tensor, "n"]]:
     """Anchors at decoded pixels; whether the neighbourhood is smooth and the rays meet in front of both devices."""
     seen = maps.look_up(frame, uv)
+    p, normal, good = _surface(rig, frame, uv, seen)
+    depth = p.norm(dim=-1)
+    return Anchors(frame, p / depth[:, None], seen.uv_projector, depth, normal), seen.valid & good
+
+
+def with_common_normals(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps) -> Anchors:
+    """Anchors with the mean of the normals that all frames show there: their own, and those that look them up.
+
+    Derivatives of residuals depend on normals. Their noise looks like information (errors in variables: Fuller, 1987):
+    a step along a direction in which the surface slides would be a hundredth of what it should be. So normals are means
+    over frames, and of windows that are wider than those of single look-ups.
+    """
+    own_uv, (uv, _) = project(rig.camera[anchors.frame], anchors.d_camera)[0], pixels_of_rows(rig, anchors, rows)
+    frame = torch.cat([anchors.frame, rows.frame])
+    seen = maps.for_normals.look_up(frame, torch.cat([own_uv, uv]))
+    _, normal, good = _surface(rig, frame, torch.cat([own_uv, uv]), seen)
+    good &= seen.valid
+    normal = rotate(rig.T_world_camera[frame], normal)
+    count = len(anchors.frame)
+    narrow = rotate(rig.T_world_camera[anchors.frame], anchors.normal)
+    own = torch.where(good[:count, None], normal[:count], narrow)
+    theirs, at = normal[count:], own[rows.anchor]
+    alike = good[count:] & ((theirs * at).sum(-1) > _LEAST_ALIKE)  # another one is that of another surface
+    total = own.index_add(0, rows.anchor, torch.where(alike[:, None], theirs, torch.zeros_like(theirs)))
+    total = torch.nn.functional.normalize(total, dim=-1)
+    return replace(anchors, normal=rotate(inverse(rig.T_world_camera)[anchors.frame], total))
+
+
+def _surface(
+    rig: Rig, frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"], seen: MapSample
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+    """Points where rays meet, normals towards the camera, in its axes; whether they meet in front of both devices."""
     p, good = _meet(rig, frame, uv, seen.uv_projector)
     edges = []
     for axis in range(2):
-        beside, there = uv + torch.eye(2, dtype=uv.dtype)[axis], seen.uv_projector + seen.jacobian[..., axis]
-        edges.append(_meet(rig, frame, beside, there)[0] - p)
+        beside = uv + _STEP * torch.eye(2, dtype=uv.dtype)[axis]
+        edges.append(_meet(rig, frame, beside, seen.uv_projector + _STEP * seen.jacobian[..., axis])[0] - p)
     normal = torch.nn.functional.normalize(torch.linalg.cross(edges[0], edges[1]), dim=-1)
-    normal = -normal * (normal * p).sum(-1, keepdim=True).sign()
-    depth = p.norm(dim=-1)
-    return Anchors(frame, p / depth[:, None], seen.uv_projector, depth, normal), seen.valid & good
+    return p, -normal * (normal * p).sum(-1, keepdim=True).sign(), good
 
 
 def in_front_of(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps) -> Bool[Tensor, "rows"]:

@@ -121,6 +121,8 @@ def _after(twist: Float[Tensor, "n 6"], T: Float[Tensor, "n 4 4"]) -> Float[Tens
     return torch.from_numpy(out)
 
 
+GRAZING = 0.05  # least cosine between the surface and a ray for derivatives
+
 # Compiled residuals and derivatives. `devices` are `Rig.arrays`. Arrays for derivatives may be empty: then none are
 # computed.
 
@@ -170,10 +172,14 @@ def positions(first, last, devices, frame, rays, depths, anchor, viewer, uv, in_
 
 @compiled_range
 def cross_residuals(
-    first, last, devices, frame, rays, depths, anchor, viewer, seen, seen_by_pixel, residual, by_pose, by_depth
+    first, last, devices, frame, rays, depths, normals, anchor, viewer, seen, residual, by_pose, by_depth
 ):
-    """Cross residuals: the views of their projectors less what other frames decoded (`seen`, `seen_by_pixel`)."""
-    T_world_camera, T_camera_world, T_projector_camera, cameras, camera_code, projector, projector_code = devices
+    """Cross residuals: the views of their projectors less what other frames decoded (`seen`).
+
+    A point that moves along the surface changes nothing: what its projector shows there and what was decoded there move
+    alike. So the derivative by the point is that by its distance from the surface, along the camera's ray.
+    """
+    T_world_camera, T_camera_world, T_projector_camera, _, _, projector, projector_code = devices
     derivatives = len(by_depth) > 0
     for k in range(first, last):
         n, j = anchor[k], viewer[k]
@@ -184,17 +190,22 @@ def cross_residuals(
         u, v, _, ux, uy, uz, vx, vy, vz = view_of(projector_code, *moved(T, xj, yj, zj), projector)
         residual[k, 0], residual[k, 1] = u - seen[k, 0], v - seen[k, 1]
         if derivatives:
-            _, _, _, cux, cuy, cuz, cvx, cvy, cvz = view_of(camera_code, xj, yj, zj, cameras[j])
-            R = T_world_camera[i]
+            R, normal = T_world_camera[i], normals[n]
+            nx = R[0, 0] * normal[0] + R[0, 1] * normal[1] + R[0, 2] * normal[2]
+            ny = R[1, 0] * normal[0] + R[1, 1] * normal[1] + R[1, 2] * normal[2]
+            nz = R[2, 0] * normal[0] + R[2, 1] * normal[1] + R[2, 2] * normal[2]
+            C = T_world_camera[j]
+            distance = np.sqrt(xj * xj + yj * yj + zj * zj)
+            facing = nx * (C[0, 3] - x) + ny * (C[1, 3] - y) + nz * (C[2, 3] - z)
+            facing = -max(facing, GRAZING * distance)  # the normal times the ray, which has the length `distance`
             dx = R[0, 0] * ray[0] + R[0, 1] * ray[1] + R[0, 2] * ray[2]
             dy = R[1, 0] * ray[0] + R[1, 1] * ray[1] + R[1, 2] * ray[2]
             dz = R[2, 0] * ray[0] + R[2, 1] * ray[1] + R[2, 2] * ray[2]
             for c, row in ((0, (ux, uy, uz)), (1, (vx, vy, vz))):
                 a, b, d = row_times_rotation(row[0], row[1], row[2], T)
                 _by_increment(by_pose[k, c], np.int64(12), -1.0, a, b, d, xj, yj, zj)
-                du, dv = seen_by_pixel[k, c, 0], seen_by_pixel[k, c, 1]
-                a, b, d = a - du * cux - dv * cvx, b - du * cuy - dv * cvy, d - du * cuz - dv * cvz
-                a, b, d = row_times_rotation(a, b, d, T_camera_world[j])
+                along_ray = (a * xj + b * yj + d * zj) / facing
+                a, b, d = along_ray * nx, along_ray * ny, along_ray * nz
                 _by_increment(by_pose[k, c], np.int64(0), 1.0, a, b, d, x, y, z)
                 _by_increment(by_pose[k, c], np.int64(6), -1.0, a, b, d, x, y, z)
                 by_depth[k, c] = a * dx + b * dy + d * dz
@@ -319,8 +330,8 @@ def _residuals(
     seen = maps.look_up(observations.frame, uv, observations.memory)
     cross = np.empty((len(uv), 2))
     cross_residuals(
-        len(cross), devices, *points, array(observations.anchor), array(observations.frame),
-        array(seen.uv_projector), array(seen.jacobian), cross, by_pose, by_depth,
+        len(cross), devices, *points, array(anchors.normal), array(observations.anchor), array(observations.frame),
+        array(seen.uv_projector), cross, by_pose, by_depth,
     )  # fmt: skip
     return Residuals(torch.from_numpy(own), torch.from_numpy(cross), seen.valid & in_front)
 

@@ -20,6 +20,7 @@ from sl_nerfstudio.bundle_adjustment.observations import (
     partners,
     place_anchors,
     useful_distance,
+    with_common_normals,
 )
 from sl_nerfstudio.bundle_adjustment.parameters import (
     PosePrior,
@@ -49,6 +50,7 @@ PARTNERS = 64  # frames, about, in which anchors of one frame may be looked up: 
 _LEAST_ANCHORS = 60  # of each frame, however many frames there are
 _RIGID_ITERATIONS = 5  # steps in which frames move as a whole, before projectors move relative to their cameras
 _OBSERVE_EVERY = 4  # steps between new choices of which frame sees which anchor
+_NORMALS_EVERY = 8  # steps between new normals of the surface
 INDEPENDENT = 50.0  # residuals of a frame that count as independent of each other while the poses are still rough
 _KERNEL_MEDIANS = 2.0  # width that a frame's kernel narrows to, in its median residuals
 _KERNEL_NOISES = 3.0  # smallest width, in estimated noises
@@ -168,6 +170,10 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
     for iteration in track(range(stage.iterations), "Adjusting poses"):
         if stage.rough and iteration % _OBSERVE_EVERY == 0:
             found = replace(found, rows=problem.observe(found.state))
+        if iteration % _NORMALS_EVERY == 0:
+            state = found.state
+            anchors = with_common_normals(state.rig, state.anchors, found.rows, maps)
+            found = replace(found, state=replace(state, anchors=anchors))
         linear = linearise(found.state.rig, found.state.anchors, found.rows, maps)
         r = linear.residuals
         target = _KERNEL_MEDIANS * frame_medians(r, found.pairs, start.frames)

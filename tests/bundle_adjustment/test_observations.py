@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sl_nerfstudio.bundle_adjustment import observations
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.observations import (
     Kernel,
     away_from_borders,
@@ -19,11 +20,13 @@ from sl_nerfstudio.bundle_adjustment.observations import (
     partners,
     place_anchors,
     useful_distance,
+    with_common_normals,
 )
 from sl_nerfstudio.bundle_adjustment.residuals import Residuals
 from sl_nerfstudio.geometry.lie import rotate, transform
 
-from .analytic import ExactMaps, cast, rig_of
+from . import analytic
+from .analytic import ExactMaps, cast, images_of, rig_of
 
 FRAMES, SIZE = 5, 90
 ALL = float("inf")
@@ -260,3 +263,22 @@ def test_look_ups_are_useful_from_where_residuals_are_no_larger_than_usual():
     assert least == pytest.approx(20, abs=1)
     distance, size = noisy(0, 1.0)
     assert useful_distance(distance, torch.where(distance > 30, 9 * size, size)) == 0
+
+
+def test_normals_of_all_frames_have_a_fraction_of_the_error_of_those_of_one(monkeypatch):
+    """Of a disk whose coordinates are noisy; without noise they are exact."""
+    monkeypatch.setattr(analytic, "BALLS", ())
+    rig, size = rig_of(6, 200), 200
+    errors = []
+    for noise in (0.0, 0.3):
+        generator = torch.Generator().manual_seed(0)
+        images = [image + noise * torch.randn(image.shape, generator=generator) for image in images_of(rig, size)]
+        maps = CoordinateMaps.of(images)
+        anchors = place_anchors(rig, maps, 100, generator)
+        rows = observe(rig, anchors, maps, 5, float("inf"), 0.1, generator)
+        for found in (anchors, with_common_normals(rig, anchors, rows, maps)):
+            up = rotate(rig.T_world_camera[found.frame], found.normal)[:, 2]
+            errors.append(float(torch.rad2deg(torch.arccos(up.clamp(-1, 1))).square().mean().sqrt()))
+    of_one, of_all = errors[2:]
+    assert max(errors[:2]) < 0.05 and of_one > 3
+    assert of_all < of_one / 6

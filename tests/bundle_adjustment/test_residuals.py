@@ -12,7 +12,7 @@ from sl_nerfstudio.geometry.lie import transform
 
 from .analytic import ExactMaps, cast, dense, disturbed, images_of, rig_of
 
-FRAMES, SIZE, STEP = 4, 80, 1e-6
+FRAMES, SIZE, STEP = 4, 80, 1e-5
 
 
 @pytest.fixture(scope="module", params=["pinhole", "DOE"])
@@ -47,12 +47,15 @@ def moved(rig: Rig, which: int, frames: slice, index: int, step: float) -> Rig:
     return rig.moved(x[0], x[1])
 
 
-def test_jacobians_are_central_differences_of_the_residuals(scene):
-    """At a disturbed rig. A window's paraboloid is the same throughout its pixel, so the derivative is exact there."""
-    true, maps, anchors, observations = scene
-    rig = disturbed(true, 3, degrees=0.3, shift=0.01, relative=0.5)
+@pytest.mark.parametrize("projector", ["pinhole", "DOE"])
+def test_jacobians_are_central_differences_of_the_residuals(projector):
+    """At the true rig, of frames that see the same surface: of that the derivatives take the normal."""
+    rig, generator = rig_of(FRAMES, SIZE, projector), torch.Generator().manual_seed(0)
+    maps = ExactMaps.around(rig, SIZE)
+    anchors = place_anchors(rig, maps, 60, generator)
+    observations = observe(rig, anchors, maps, 3, 20.0, 0.1, generator)
     linear = linearise(rig, anchors, observations, maps)
-    ok = linear.residuals.cross_valid
+    ok = linear.residuals.cross_valid & (linear.residuals.cross.norm(dim=-1) < 1e-6)
     assert ok.sum() > 150
 
     def difference(plus: Rig, minus: Rig, a: Anchors = anchors, b: Anchors = anchors):
@@ -62,7 +65,7 @@ def test_jacobians_are_central_differences_of_the_residuals(scene):
     def agrees(found: torch.Tensor, expected: torch.Tensor, rows: torch.Tensor) -> None:
         scale = float(expected[rows].abs().max().clamp_min(1.0))
         error = ((found - expected)[rows].abs() / scale).amax(-1)
-        assert (error > 1e-6).sum() <= 2  # a position may cross into the next pixel within the step
+        assert error.max() < 3e-4
 
     every = torch.ones(len(anchors.frame), dtype=torch.bool)
     own, cross = difference(rig, rig, anchors.at(anchors.depth + STEP), anchors.at(anchors.depth - STEP))
