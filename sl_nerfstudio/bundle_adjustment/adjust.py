@@ -27,7 +27,7 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     prior_equations,
 )
 from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Rig, linearise, residuals_of
+from sl_nerfstudio.bundle_adjustment.residuals import OWN_PLACE_PX, Anchors, Observations, Rig, linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.search import (
     LEAST_COSINE,
     PARTNERS,
@@ -106,12 +106,12 @@ def _result(explored: Explored, before: float) -> Adjustment:
     """Poses with their covariance; all residuals have full weight, whichever stage the steps ended in."""
     problem, found = explored.problem, explored.best
     state, maps = found.state, problem.maps
-    linear = linearise(state.rig, state.anchors, found.rows, maps)
-    r = linear.residuals
+    scene = state.rig, state.anchors, found.rows, maps
+    exact, smooth = (linearise_with_intrinsics(linearise(*scene, px), *scene) for px in (0.0, OWN_PLACE_PX))
+    r = exact.residuals
     kernel = kernel_of(state, found.rows, found.widths, r)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
-    extended = linearise_with_intrinsics(linear, state.rig, state.anchors, found.rows, maps)
-    evidence = CovarianceEvidence(state.rig, state.anchors, found.rows, extended, kernel)
+    evidence = CovarianceEvidence(state.rig, state.anchors, found.rows, exact, smooth, kernel)
     free = free_parameters(explored.refine, state.rig)
     factor, intrinsics = pose_covariance(evidence, free, problem.start, problem.prior, found.noise)
     return Adjustment(

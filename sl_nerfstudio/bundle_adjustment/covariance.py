@@ -143,7 +143,8 @@ class CovarianceEvidence:
     rig: Rig
     anchors: Anchors
     rows: Observations
-    linear: Linearisation
+    linear: Linearisation  # with the derivatives of single look-ups, of which the gradients at the result are
+    smooth: Linearisation  # with those by the surface's normals, for what residuals know
     kernel: Kernel
 
     @property
@@ -297,7 +298,7 @@ def pose_covariance(
         poses_exact = torch.zeros(12 * n, UNKNOWNS, dtype=torch.float64)
         return torch.cat([poses_exact, prior.intrinsics_sigma.diag()]), None
     weights = e.kernel.weights(e.linear.residuals)
-    equations = normal_equations(e.linear, e.rows, *weights)
+    equations, smooth = (normal_equations(linear, e.rows, *weights) for linear in (e.linear, e.smooth))
     g = torch.cat([equations.g.flatten(), equations.g_common])
     H_frames, g_frames = prior_equations(prior, start, e.rig)
     H_common = 1 / prior.intrinsics_sigma.clamp_min(_EXACT) ** 2  # of the prior, diagonal
@@ -315,7 +316,7 @@ def pose_covariance(
         A factor of the covariance for independent residuals; how much larger each sigma really is; the step that is
         left.
         """
-        factor = Cholesky.in_place(free.matrix(equations.matrix(noise**2 * H_frames, noise**2 * H_common)))
+        factor = Cholesky.in_place(free.matrix(smooth.matrix(noise**2 * H_frames, noise**2 * H_common)))
         formal = noise * _increments(free, G, factor.root(unit_columns(rows, len(g))))
         caused = _together(spread, noise**2 * _prior_root(H_frames, H_common))
         pulls = torch.cat([caused, (g + noise**2 * g_prior)[:, None]], 1)

@@ -121,7 +121,8 @@ def _after(twist: Float[Tensor, "n 6"], T: Float[Tensor, "n 4 4"]) -> Float[Tens
     return torch.from_numpy(out)
 
 
-GRAZING = 0.05  # least cosine between the surface and a ray for derivatives
+OWN_PLACE_PX = 4.0  # residual up to which a look-up is taken to see the anchor's own place: about a window
+GRAZING = 0.05  # least cosine between the surface's normal and a ray for derivatives
 
 # Compiled residuals and derivatives. `devices` are `Rig.arrays`. Arrays for derivatives may be empty: then none are
 # computed.
@@ -134,6 +135,16 @@ def _by_increment(out, first, sign, a, b, c, x, y, z):
     out[first + 3] = -sign * (b * z - c * y)
     out[first + 4] = -sign * (c * x - a * z)
     out[first + 5] = -sign * (a * y - b * x)
+
+
+@compiled
+def _rotated(R, v):
+    """R v, for the rotation of a pose."""
+    return (
+        R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
+        R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
+        R[2, 0] * v[0] + R[2, 1] * v[1] + R[2, 2] * v[2],
+    )
 
 
 @compiled
@@ -172,14 +183,17 @@ def positions(first, last, devices, frame, rays, depths, anchor, viewer, uv, in_
 
 @compiled_range
 def cross_residuals(
-    first, last, devices, frame, rays, depths, normals, anchor, viewer, seen, residual, by_pose, by_depth
-):
-    """Cross residuals: the views of their projectors less what other frames decoded (`seen`).
+    first, last, devices, frame, rays, depths, normals, anchor, viewer, seen, seen_by_pixel, own_place, residual,
+    by_pose, by_depth,
+):  # fmt: skip
+    """Cross residuals: the views of their projectors less what other frames decoded (`seen`, `seen_by_pixel`).
 
     A point that moves along the surface changes nothing: what its projector shows there and what was decoded there move
-    alike. So the derivative by the point is that by its distance from the surface, along the camera's ray.
+    alike. So the derivative by the point is that by its distance from the surface, along the camera's ray. That holds
+    for look-ups that see the anchor's own place, whose residual is below `own_place`. The others see another part of
+    the surface, which has another slope: that of the coordinates which are looked up.
     """
-    T_world_camera, T_camera_world, T_projector_camera, _, _, projector, projector_code = devices
+    T_world_camera, T_camera_world, T_projector_camera, cameras, camera_code, projector, projector_code = devices
     derivatives = len(by_depth) > 0
     for k in range(first, last):
         n, j = anchor[k], viewer[k]
@@ -190,22 +204,23 @@ def cross_residuals(
         u, v, _, ux, uy, uz, vx, vy, vz = view_of(projector_code, *moved(T, xj, yj, zj), projector)
         residual[k, 0], residual[k, 1] = u - seen[k, 0], v - seen[k, 1]
         if derivatives:
-            R, normal = T_world_camera[i], normals[n]
-            nx = R[0, 0] * normal[0] + R[0, 1] * normal[1] + R[0, 2] * normal[2]
-            ny = R[1, 0] * normal[0] + R[1, 1] * normal[1] + R[1, 2] * normal[2]
-            nz = R[2, 0] * normal[0] + R[2, 1] * normal[1] + R[2, 2] * normal[2]
-            C = T_world_camera[j]
-            distance = np.sqrt(xj * xj + yj * yj + zj * zj)
+            by_normal = residual[k, 0] ** 2 + residual[k, 1] ** 2 < own_place**2
+            R, C, normal = T_world_camera[i], T_world_camera[j], normals[n]
+            dx, dy, dz = _rotated(R, ray)
+            nx, ny, nz = _rotated(R, normal)
             facing = nx * (C[0, 3] - x) + ny * (C[1, 3] - y) + nz * (C[2, 3] - z)
-            facing = -max(facing, GRAZING * distance)  # the normal times the ray, which has the length `distance`
-            dx = R[0, 0] * ray[0] + R[0, 1] * ray[1] + R[0, 2] * ray[2]
-            dy = R[1, 0] * ray[0] + R[1, 1] * ray[1] + R[1, 2] * ray[2]
-            dz = R[2, 0] * ray[0] + R[2, 1] * ray[1] + R[2, 2] * ray[2]
+            along = -max(facing, GRAZING * np.sqrt(xj * xj + yj * yj + zj * zj))  # the normal times the camera's ray
+            _, _, _, cux, cuy, cuz, cvx, cvy, cvz = view_of(camera_code, xj, yj, zj, cameras[j])
             for c, row in ((0, (ux, uy, uz)), (1, (vx, vy, vz))):
                 a, b, d = row_times_rotation(row[0], row[1], row[2], T)
                 _by_increment(by_pose[k, c], np.int64(12), -1.0, a, b, d, xj, yj, zj)
-                along_ray = (a * xj + b * yj + d * zj) / facing
-                a, b, d = along_ray * nx, along_ray * ny, along_ray * nz
+                if by_normal:
+                    by_distance = (a * xj + b * yj + d * zj) / along
+                    a, b, d = by_distance * nx, by_distance * ny, by_distance * nz
+                else:
+                    du, dv = seen_by_pixel[k, c, 0], seen_by_pixel[k, c, 1]
+                    a, b, d = a - du * cux - dv * cvx, b - du * cuy - dv * cvy, d - du * cuz - dv * cvz
+                    a, b, d = row_times_rotation(a, b, d, T_camera_world[j])
                 _by_increment(by_pose[k, c], np.int64(0), 1.0, a, b, d, x, y, z)
                 _by_increment(by_pose[k, c], np.int64(6), -1.0, a, b, d, x, y, z)
                 by_depth[k, c] = a * dx + b * dy + d * dz
@@ -283,11 +298,17 @@ class Linearisation:
         return 12 * self.frames + self.common
 
 
-def linearise(rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps) -> Linearisation:
-    """Residuals and first derivatives at the current state."""
+def linearise(
+    rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps, own_place_px: float = OWN_PLACE_PX
+) -> Linearisation:
+    """Residuals and first derivatives at the current state.
+
+    Residuals below `own_place_px` have derivatives by the anchors' normals; 0: all are those of single look-ups, exact
+    but noisy.
+    """
     m, n = len(anchors.frame), len(observations.anchor)
     derivatives = tuple(torch.empty(*size, dtype=torch.float64) for size in ((m, 2, 6), (m, 2), (n, 2, 18), (n, 2)))
-    residuals = _residuals(rig, anchors, observations, maps, derivatives)
+    residuals = _residuals(rig, anchors, observations, maps, derivatives, own_place_px)
     own, own_depth, cross, cross_depth = derivatives
     pairs = observations.pairs(anchors)
     return Linearisation(residuals, own, own_depth, anchors.frame, cross, cross_depth, pairs, rig.frames)
@@ -319,8 +340,9 @@ def viewing_cosines(rig: Rig, anchors: Anchors, observations: Observations) -> F
 
 
 def _residuals(
-    rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps, derivatives: tuple[Tensor, ...]
-) -> Residuals:
+    rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps, derivatives: tuple[Tensor, ...],
+    own_place_px: float = OWN_PLACE_PX,
+) -> Residuals:  # fmt: skip
     """Residuals; their derivatives are written to arrays that are not empty."""
     own_by_pose, own_by_depth, by_pose, by_depth = (part.numpy() for part in derivatives)
     devices, points = rig.arrays, _anchor_arrays(anchors)
@@ -331,7 +353,7 @@ def _residuals(
     cross = np.empty((len(uv), 2))
     cross_residuals(
         len(cross), devices, *points, array(anchors.normal), array(observations.anchor), array(observations.frame),
-        array(seen.uv_projector), cross, by_pose, by_depth,
+        array(seen.uv_projector), array(seen.jacobian), own_place_px, cross, by_pose, by_depth,
     )  # fmt: skip
     return Residuals(torch.from_numpy(own), torch.from_numpy(cross), seen.valid & in_front)
 

@@ -30,6 +30,7 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     rough_weight,
 )
 from sl_nerfstudio.bundle_adjustment.residuals import (
+    OWN_PLACE_PX,
     Anchors,
     Observations,
     Residuals,
@@ -49,6 +50,7 @@ LEAST_COSINE = 0.1  # between surface normal and ray; below it a device counts a
 PARTNERS = 64  # frames, about, in which anchors of one frame may be looked up: many frames take time by their number
 _LEAST_ANCHORS = 60  # of each frame, however many frames there are
 _RIGID_ITERATIONS = 5  # steps in which frames move as a whole, before projectors move relative to their cameras
+_LEAST_ITERATIONS = 4  # of the last steps, whose derivatives are exact
 _OBSERVE_EVERY = 4  # steps between new choices of which frame sees which anchor
 _NORMALS_EVERY = 8  # steps between new normals of the surface
 INDEPENDENT = 50.0  # residuals of a frame that count as independent of each other while the poses are still rough
@@ -74,7 +76,7 @@ class AdjustmentSettings:
     """Decoded pixels of all frames, at most: time grows with this number, accuracy with its square root."""
     frames_per_anchor: int = 8
     """Most other frames in which each of them is looked up."""
-    max_iterations: int = 40
+    max_iterations: int = 80
     """Most Levenberg-Marquardt steps."""
     seed: int = 0
     """Seed of the choice of pixels."""
@@ -147,6 +149,7 @@ class SearchStage:
     refine: RefinePoses
     rough: bool  # residuals still come from wrong poses: those of one frame are correlated and count as few
     iterations: int  # at most
+    own_place_px: float = OWN_PLACE_PX  # see `linearise`
 
 
 def stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[SearchStage]:
@@ -170,11 +173,11 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
     for iteration in track(range(stage.iterations), "Adjusting poses"):
         if stage.rough and iteration % _OBSERVE_EVERY == 0:
             found = replace(found, rows=problem.observe(found.state))
-        if iteration % _NORMALS_EVERY == 0:
+        if stage.own_place_px and iteration % _NORMALS_EVERY == 0:
             state = found.state
             anchors = with_common_normals(state.rig, state.anchors, found.rows, maps)
             found = replace(found, state=replace(state, anchors=anchors))
-        linear = linearise(found.state.rig, found.state.anchors, found.rows, maps)
+        linear = linearise(found.state.rig, found.state.anchors, found.rows, maps, stage.own_place_px)
         r = linear.residuals
         target = _KERNEL_MEDIANS * frame_medians(r, found.pairs, start.frames)
         noise = noise_of(r, float(torch.minimum(found.widths, target).min()))
@@ -225,7 +228,9 @@ def search(problem: SearchProblem, refine: RefinePoses) -> tuple[SearchProgress,
     for stage in rough:
         found = run_stage(problem, stage, found)
     found = _away_from_borders(problem, found)
-    found = run_stage(problem, replace(last, iterations=max(settings.max_iterations - found.iterations, 1)), found)
+    for own_place_px in (last.own_place_px, 0.0):
+        left = max(settings.max_iterations - found.iterations, _LEAST_ITERATIONS)
+        found = run_stage(problem, replace(last, iterations=left, own_place_px=own_place_px), found)
     return found, before
 
 
