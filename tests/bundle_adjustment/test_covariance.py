@@ -115,7 +115,7 @@ def by_inverses(
     """The covariance with all matrices written out, and the self-calibration."""
     n, weights = e.rig.frames, e.kernel.weights(e.linear.residuals)
     size = 12 * n + UNKNOWNS
-    equations = normal_equations(e.smooth, e.rows, *weights)
+    equations = normal_equations(e.linear, e.rows, *weights)
     H_data = without_prior(normal_equations(e.smooth, e.rows, *weights))
     H_frames, g_frames = prior_equations(prior, start, e.rig)
     weight = 1 / prior.intrinsics_sigma**2
