@@ -83,10 +83,14 @@ class Case:
         return [self.row(f"{stage}: {name}", Part(**part)) for name, part in found.items()]
 
 
-def forget(scan: Path) -> None:
-    """Remove a scan folder and the decoded frames that were kept for it."""
-    for folder in (scan, scan.with_name(scan.name + ".work")):
-        shutil.rmtree(folder, ignore_errors=True)
+SCANS = "scan", "scan-before", "scan-phases"  # by sl-process, by an earlier version of it, and for its phases
+
+
+def forget(folder: Path) -> None:
+    """Remove all scans of a folder, and the decoded frames that were kept for them: any of these would be taken."""
+    for name in SCANS:
+        for kept in (folder / name, folder / f"{name}.work"):
+            shutil.rmtree(kept, ignore_errors=True)
 
 
 def phases_of_process(images: Path, scan: Path, jobs: int) -> dict[str, Part]:
@@ -110,7 +114,7 @@ def phases_of_process(images: Path, scan: Path, jobs: int) -> dict[str, Part]:
         found[name] = Part(time.monotonic() - wall, used() - cpu, peak_gb())
 
     process.phase = timed  # type: ignore[assignment]
-    forget(scan)
+    forget(scan.parent)
     config = ProcessConfig(
         images=images / "images", pattern=images / "pattern.json", intrinsics=images / "intrinsics.json", output=scan,
         jobs=jobs,
@@ -157,40 +161,21 @@ def stages(case: Case, photographs: bool, until: str, before: Path | None) -> di
 
     def process(stage: str, version: Path | None) -> list[Row]:
         output = scan if version is None else folder / "scan-before"
-        forget(output)
-        flags = (
-            "--images",
-            images / "images",
-            "--pattern",
-            images / "pattern.json",
-            "--intrinsics",
-            images / "intrinsics.json",
-        )
-        return [
-            case.command(stage, None, "sl-process", *flags, "--output", output, "--jobs", case.jobs, version=version)
-        ]
+        forget(folder)
+        words = ("sl-process", "--images", images / "images", "--pattern", images / "pattern.json", "--intrinsics",
+                 images / "intrinsics.json", "--output", output, "--jobs", case.jobs)  # fmt: skip
+        return [case.command(stage, None, *words, version=version)]
 
     found: dict[str, Callable[[], list[Row]]] = {}
     if photographs:
-        found["sl-synth --images-only"] = lambda: [
-            case.command(
-                "sl-synth --images-only",
-                images,
-                "sl-synth",
-                "--output",
-                images,
-                "--images-only",
-                "--background",
-                "table",
-                *synth,
-            )
-        ]
+        make = ("sl-synth", "--output", images, "--images-only", "--background", "table", *synth)
+        found["sl-synth --images-only"] = lambda: [case.command("sl-synth --images-only", images, *make)]
         if before is not None:
             found["sl-process, before"] = lambda: process("sl-process, before", before)
-        found["sl-process"] = lambda: process("sl-process", None)
         found["sl-process: read"] = lambda: case.parts(
             "sl-process", "--phases", images, folder / "scan-phases", "--jobs", case.jobs
         )
+        found["sl-process"] = lambda: process("sl-process", None)
     else:
         found["sl-synth"] = lambda: [case.command("sl-synth", scan, "sl-synth", "--output", scan, *synth)]
         found["sl-check"] = lambda: [case.command("sl-check", None, "sl-check", scan)]
