@@ -15,7 +15,7 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import CovarianceEvidence, gauge_free, pose_covariance
 from sl_nerfstudio.bundle_adjustment.modes import Explored, Mode, explore, with_others
-from sl_nerfstudio.bundle_adjustment.observations import NOISE_FLOOR_PX, observe, partners
+from sl_nerfstudio.bundle_adjustment.observations import NOISE_FLOOR_PX, observe, partners, with_common_normals
 from sl_nerfstudio.bundle_adjustment.parameters import (
     UNKNOWNS,
     FreeParameters,
@@ -26,12 +26,16 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     linearise_with_intrinsics,
     prior_equations,
 )
-from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error
+from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error, odds
 from sl_nerfstudio.bundle_adjustment.residuals import OWN_PLACE_PX, Anchors, Observations, Rig, linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.search import (
+    FRAMES_MOVE,
     LEAST_COSINE,
     PARTNERS,
     AdjustmentSettings,
+    SearchProblem,
+    SearchProgress,
+    along_surface,
     kernel_of,
     problem_of,
     search,
@@ -89,8 +93,17 @@ def find_minimum(
     first = search(problem, refine)
     if first is None:
         return _unmoved(start, prior, free_parameters(refine, start))
-    found = explore(problem, refine, first[0])
+    found = explore(problem, refine, _likelier(problem, refine, first[0]))
     return replace(_result(found, first[1]), explored=found)
+
+
+def _likelier(problem: SearchProblem, refine: RefinePoses, first: SearchProgress) -> SearchProgress:
+    """The end of a search, or where more steps along the surface lead, if that is more probable."""
+    if refine not in FRAMES_MOVE:
+        return first
+    end = along_surface(problem, refine, first)
+    better = odds(problem, end.state.rig, first.state.rig, min(end.noise, first.noise)).better
+    return end if better else first
 
 
 @one_library_thread()
@@ -106,6 +119,7 @@ def _result(explored: Explored, before: float) -> Adjustment:
     """Poses with their covariance; all residuals have full weight, whichever stage the steps ended in."""
     problem, found = explored.problem, explored.best
     state, maps = found.state, problem.maps
+    state = replace(state, anchors=with_common_normals(state.rig, state.anchors, found.rows, maps))
     scene = state.rig, state.anchors, found.rows, maps
     exact, smooth = (linearise_with_intrinsics(linearise(*scene, px), *scene) for px in (0.0, OWN_PLACE_PX))
     r = exact.residuals

@@ -244,7 +244,7 @@ def _shaken_leads_back(
     equations = normal_equations(linear, best.rows, *kernel.weights(linear.residuals))
     rig, anchors = moved_together(state.rig, state.anchors, equations, torch.cat([delta, rho], 1))
     beside = replace(state, rig=rig, anchors=anchors)
-    back = run_stage(problem, SearchStage(found.refine, False, _SHAKE_STEPS, 0.0), replace(best, state=beside))
+    back = run_stage(problem, SearchStage(found.refine, False, _SHAKE_STEPS), replace(best, state=beside))
     end = with_frames_of(back.state.rig, found.rig, unplaced)
     return farthest_frame(factor, departure_of(end, found.rig)) <= _MOST_LEFT * _SHAKE_SIGMAS
 

@@ -50,7 +50,6 @@ LEAST_COSINE = 0.1  # between surface normal and ray; below it a device counts a
 PARTNERS = 64  # frames, about, in which anchors of one frame may be looked up: many frames take time by their number
 _LEAST_ANCHORS = 60  # of each frame, however many frames there are
 _RIGID_ITERATIONS = 5  # steps in which frames move as a whole, before projectors move relative to their cameras
-_LEAST_ITERATIONS = 4  # of the last steps, whose derivatives are exact
 _OBSERVE_EVERY = 4  # steps between new choices of which frame sees which anchor
 _NORMALS_EVERY = 8  # steps between new normals of the surface
 INDEPENDENT = 50.0  # residuals of a frame that count as independent of each other while the poses are still rough
@@ -76,7 +75,7 @@ class AdjustmentSettings:
     """Decoded pixels of all frames, at most: time grows with this number, accuracy with its square root."""
     frames_per_anchor: int = 8
     """Most other frames in which each of them is looked up."""
-    max_iterations: int = 80
+    max_iterations: int = 40
     """Most Levenberg-Marquardt steps."""
     seed: int = 0
     """Seed of the choice of pixels."""
@@ -149,7 +148,7 @@ class SearchStage:
     refine: RefinePoses
     rough: bool  # residuals still come from wrong poses: those of one frame are correlated and count as few
     iterations: int  # at most
-    own_place_px: float = OWN_PLACE_PX  # see `linearise`
+    own_place_px: float = 0.0  # see `linearise`
 
 
 def stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[SearchStage]:
@@ -228,10 +227,25 @@ def search(problem: SearchProblem, refine: RefinePoses) -> tuple[SearchProgress,
     for stage in rough:
         found = run_stage(problem, stage, found)
     found = _away_from_borders(problem, found)
-    for own_place_px in (last.own_place_px, 0.0):
-        left = max(settings.max_iterations - found.iterations, _LEAST_ITERATIONS)
-        found = run_stage(problem, replace(last, iterations=left, own_place_px=own_place_px), found)
+    found = run_stage(problem, replace(last, iterations=max(settings.max_iterations - found.iterations, 1)), found)
     return found, before
+
+
+def along_surface(problem: SearchProblem, refine: RefinePoses, found: SearchProgress) -> SearchProgress:
+    """More steps from the end of a search, along directions in which the surface slides.
+
+    There the noise of slopes looks like information, so steps by the slopes of single look-ups are a hundredth of what
+    they should be. These are by the surface's normals, but the last ones: details of the surface that are smaller than
+    the windows of normals show in single look-ups alone.
+    """
+    here = problem_of(problem.start, problem.maps, problem.prior, problem.settings, found.state.rig)
+    state = LMState(found.state.rig, here.anchors, DAMPING)
+    found = replace(found, state=state, rows=here.observe(state))
+    steps = problem.settings.max_iterations
+    found = run_stage(here, SearchStage(refine, True, steps, OWN_PLACE_PX), found)
+    found = _away_from_borders(here, found)
+    found = run_stage(here, SearchStage(refine, False, steps, OWN_PLACE_PX), found)
+    return run_stage(here, SearchStage(refine, False, steps, 0.0), found)
 
 
 def _away_from_borders(problem: SearchProblem, found: SearchProgress) -> SearchProgress:
