@@ -15,7 +15,7 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.covariance import CovarianceEvidence, gauge_free, pose_covariance
 from sl_nerfstudio.bundle_adjustment.modes import Explored, Mode, explore, with_others
-from sl_nerfstudio.bundle_adjustment.observations import NOISE_FLOOR_PX, observe, partners, with_common_normals
+from sl_nerfstudio.bundle_adjustment.observations import NOISE_FLOOR_PX, observe, partners
 from sl_nerfstudio.bundle_adjustment.parameters import (
     UNKNOWNS,
     FreeParameters,
@@ -25,9 +25,10 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     free_parameters,
     linearise_with_intrinsics,
     prior_equations,
+    with_smooth_derivatives,
 )
 from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error, odds
-from sl_nerfstudio.bundle_adjustment.residuals import OWN_PLACE_PX, Anchors, Observations, Rig, linearise, residuals_of
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Observations, Rig, linearise, residuals_of
 from sl_nerfstudio.bundle_adjustment.search import (
     FRAMES_MOVE,
     LEAST_COSINE,
@@ -119,9 +120,9 @@ def _result(explored: Explored, before: float) -> Adjustment:
     """Poses with their covariance; all residuals have full weight, whichever stage the steps ended in."""
     problem, found = explored.problem, explored.best
     state, maps = found.state, problem.maps
-    state = replace(state, anchors=with_common_normals(state.rig, state.anchors, found.rows, maps))
     scene = state.rig, state.anchors, found.rows, maps
-    exact, smooth = (linearise_with_intrinsics(linearise(*scene, px), *scene) for px in (0.0, OWN_PLACE_PX))
+    exact = linearise_with_intrinsics(linearise(*scene), *scene)
+    smooth = with_smooth_derivatives(exact, *scene)
     r = exact.residuals
     kernel = kernel_of(state, found.rows, found.widths, r)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)

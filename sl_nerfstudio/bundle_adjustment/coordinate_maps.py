@@ -22,7 +22,9 @@ from sl_nerfstudio.parallel import compiled, compiled_range, results
 from sl_nerfstudio.storage import GrowingArray, largest_in_memory
 
 HALF_WINDOW = 3  # camera pixels to each side of the window in which a paraboloid is fitted
-_NORMAL_HALF_WINDOW = 6  # the same for normals of the surface
+WIDE_HALF_WINDOW = 12  # for derivatives that say how much residuals know: about a period of the pattern, within which
+# errors of coordinates are shared; derivatives of smaller windows are noisy, which looks like information
+_NORMAL_HALF_WINDOW = 6  # for normals of the surface
 _LEAST_PIXELS = 24  # decoded pixels that a window of HALF_WINDOW must hold
 _LEAST_PIVOT = 1e-3  # share of a pivot that elimination must leave; below it the window's pixels lie on a conic
 _ROUGHNESS_PX = 2.0  # RMS distance of a window from its paraboloid, pattern pixels: beyond, the map is discontinuous

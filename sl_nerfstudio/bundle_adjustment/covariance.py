@@ -143,8 +143,8 @@ class CovarianceEvidence:
     rig: Rig
     anchors: Anchors
     rows: Observations
-    linear: Linearisation  # with the derivatives of single look-ups, of which the gradients at the result are
-    smooth: Linearisation  # with those by the surface's normals, for what residuals know
+    linear: Linearisation
+    smooth: Linearisation  # the same with derivatives of wide windows, where there are any
     kernel: Kernel
 
     @property

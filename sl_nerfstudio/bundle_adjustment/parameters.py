@@ -14,8 +14,8 @@ from jaxtyping import Float, Float64, Int, Shaped
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, Rig
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import WIDE_HALF_WINDOW, CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, Rig, linearise
 from sl_nerfstudio.geometry.devices import UNCHANGED, Intrinsics, IntrinsicsChange, project, project_jacobian
 from sl_nerfstudio.geometry.lie import (
     Similarity,
@@ -432,3 +432,18 @@ def by_intrinsics(devices: Intrinsics, uv: Float[Tensor, "n 2"]) -> Float[Tensor
     out[..., 0] = uv - c
     out[..., 0, 1] = out[..., 1, 2] = f[..., 0]
     return out
+
+
+def with_smooth_derivatives(
+    linear: Linearisation, rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps
+) -> Linearisation:
+    """Replace derivatives by those of wide windows, where a paraboloid fits them."""
+    wide = maps.with_windows(WIDE_HALF_WINDOW)
+    rows = Observations(observations.anchor, observations.frame)  # with a memory of its own
+    found = linearise_with_intrinsics(linearise(rig, anchors, rows, wide), rig, anchors, rows, wide)
+    fits = found.residuals.cross_valid
+    return replace(
+        linear,
+        cross=torch.where(fits[:, None, None], found.cross, linear.cross),
+        cross_depth=torch.where(fits[:, None], found.cross_depth, linear.cross_depth),
+    )

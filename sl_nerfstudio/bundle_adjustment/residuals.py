@@ -299,12 +299,12 @@ class Linearisation:
 
 
 def linearise(
-    rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps, own_place_px: float = OWN_PLACE_PX
+    rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps, own_place_px: float = 0.0
 ) -> Linearisation:
     """Residuals and first derivatives at the current state.
 
-    Residuals below `own_place_px` have derivatives by the anchors' normals; 0: all are those of single look-ups, exact
-    but noisy.
+    Residuals below `own_place_px` have derivatives by the anchors' normals; the others those of single look-ups, which
+    are exact, but noisy.
     """
     m, n = len(anchors.frame), len(observations.anchor)
     derivatives = tuple(torch.empty(*size, dtype=torch.float64) for size in ((m, 2, 6), (m, 2), (n, 2, 18), (n, 2)))
@@ -341,7 +341,7 @@ def viewing_cosines(rig: Rig, anchors: Anchors, observations: Observations) -> F
 
 def _residuals(
     rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps, derivatives: tuple[Tensor, ...],
-    own_place_px: float = OWN_PLACE_PX,
+    own_place_px: float = 0.0,
 ) -> Residuals:  # fmt: skip
     """Residuals; their derivatives are written to arrays that are not empty."""
     own_by_pose, own_by_depth, by_pose, by_depth = (part.numpy() for part in derivatives)

@@ -7,7 +7,7 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
 from sl_nerfstudio.bundle_adjustment.parameters import gauge_directions
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Rig, linearise, residuals_of
+from sl_nerfstudio.bundle_adjustment.residuals import OWN_PLACE_PX, Anchors, Rig, linearise, residuals_of
 from sl_nerfstudio.geometry.lie import transform
 
 from .analytic import ExactMaps, cast, dense, disturbed, images_of, rig_of
@@ -54,7 +54,7 @@ def test_jacobians_are_central_differences_of_the_residuals(projector):
     maps = ExactMaps.around(rig, SIZE)
     anchors = place_anchors(rig, maps, 60, generator)
     observations = observe(rig, anchors, maps, 3, 20.0, 0.1, generator)
-    linear = linearise(rig, anchors, observations, maps)
+    linear = linearise(rig, anchors, observations, maps, OWN_PLACE_PX)
     ok = linear.residuals.cross_valid & (linear.residuals.cross.norm(dim=-1) < 1e-6)
     assert ok.sum() > 150
 
