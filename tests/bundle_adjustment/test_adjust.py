@@ -235,9 +235,9 @@ def searches(monkeypatch) -> list:
 @pytest.mark.slow
 def test_a_scene_that_holds_its_frames_is_searched_once(searches):
     size = 240
-    maps = noisy_maps(1, 0.3, size)
+    maps = noisy_maps(2, 0.3, size)
     one = find_minimum(
-        disturbed(rig_of(FEW, size), 1), maps, TIGHT, "known-rig", replace(SEVERAL, anchors_per_frame=300)
+        disturbed(rig_of(FEW, size), 2), maps, TIGHT, "known-rig", replace(SEVERAL, anchors_per_frame=300)
     )
     assert torch.equal(one.factor, with_other_minima(one).factor) and len(searches) == 1
 
