@@ -410,13 +410,8 @@ def linearise_with_intrinsics(
     )
     uv_camera = project(rig.camera[j], p_j)[0]
     seen = maps.look_up(j, uv_camera, observations.memory)
-    move_world = rig.T_world_camera[i, :3, :3] @ move
-    # The point's pixel moves in the other image: what was decoded there is the view of a point beside, on the surface.
-    ray_j = rig.camera[j]
-    K_j = project_jacobian(ray_j, p_j)
-    beside = K_j.transpose(1, 2) @ torch.linalg.solve(K_j @ K_j.transpose(1, 2), by_intrinsics(ray_j, uv_camera))
-    from_surface = linear.cross[..., :3] @ (move_world[a] + rig.T_world_camera[j, :3, :3] @ beside)
-    by_camera = from_surface + linear.cross[..., 12:15] @ beside  # that part is minus the derivative by the point alone
+    move_world = (rig.T_world_camera[i, :3, :3] @ move)[a]
+    by_camera = linear.cross[..., :3] @ move_world - seen.jacobian @ by_intrinsics(rig.camera[j], uv_camera)
     by_projector = by_intrinsics(rig.projector, linear.residuals.cross + seen.uv_projector)
     return replace(
         linear,

@@ -174,12 +174,12 @@ def test_columns_of_intrinsics_are_central_differences_of_the_residuals(projecto
     lens = replace(camera_of(100), k1=-0.08, p1=0.002)
     true = replace(rig, camera=Intrinsics.of([lens] * FRAMES, torch.float64))
     maps, generator = ExactMaps.around(true, 100), torch.Generator().manual_seed(0)
-    rig = true  # where all frames see the same surface, of which the derivatives take the normal
+    rig = disturbed(true, 3, degrees=0.2, shift=0.005, relative=0.5)
     anchors = place_anchors(rig, maps, 40, generator)
     rows = observe(rig, anchors, maps, 3, 40.0, 0.1, generator)
     linear = linearise(rig, anchors, rows, maps)
     wide = linearise_with_intrinsics(linear, rig, anchors, rows, maps)
-    ok = linear.residuals.cross_valid & (linear.residuals.cross.norm(dim=-1) < 1e-4)  # the same surface
+    ok = linear.residuals.cross_valid
     assert ok.sum() > 80 and wide.unknowns == linear.unknowns + 6
     assert torch.equal(wide.own[..., :6], linear.own) and torch.equal(wide.cross[..., :18], linear.cross)
     step = 1e-6
