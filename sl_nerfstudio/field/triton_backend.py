@@ -317,7 +317,8 @@ class TritonField:
             inputs.append(p.new_empty(n + k, rows.width))
             rows.launch(activate, n, z[layer], biases[layer], rows.knee, inputs[-1], n)
             z.append(torch.mm(inputs[-1][:n], weights[layer + 1].T))
-        d, h = [p.new_empty(n + k, rows.width) if k else f for _ in z], [f for _ in z]
+        unused = encoded  # not an output, which would keep the graph of the step that keeps it
+        d, h = [p.new_empty(n + k, rows.width) if k else unused for _ in z], [unused for _ in z]
         rows.launch(top, n, z[last], biases[last], weights[-1], biases[-1], rows.knee, p, f, d[last][n:], n, first)
         if k:
             for layer in reversed(lower):

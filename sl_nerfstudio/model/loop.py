@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from functools import partial
@@ -20,7 +21,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from sl_nerfstudio.console import Phase, paragraph, phase
-from sl_nerfstudio.errors import UserError, last_line
+from sl_nerfstudio.errors import UserError, first_line, last_line
 from sl_nerfstudio.field import numba_backend
 from sl_nerfstudio.field.backend import TableGradient
 from sl_nerfstudio.field.device_kernels import give_up
@@ -183,17 +184,29 @@ class CudaRecorder:
 
     def record(self, work: Callable[[], T]) -> tuple[Callable[[], None], T]:
         """Raises RuntimeError if the work makes the host wait, or launches something outside of its stream."""
+        graph = self._graph()
+        try:
+            with self._recording(graph):
+                result = work()
+        except RuntimeError as error:
+            with suppress(RuntimeError, AttributeError):  # else torch's allocator keeps to the recording's memory
+                torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), graph.pool())
+            with suppress(RuntimeError), warnings.catch_warnings():  # that nothing is recorded
+                warnings.simplefilter("ignore")
+                with self._recording(self._graph()):  # else random numbers remain those of a recording
+                    pass
+            raise RuntimeError(first_line(error.__context__ or error)) from error  # the cause, not that it cannot end
+        return graph.replay, result
+
+    def _graph(self) -> torch.cuda.CUDAGraph:
         graph = torch.cuda.CUDAGraph()
         for generator in self._generators:
             graph.register_generator_state(generator)
-        try:  # other threads, such as the viewer's, may use the GPU meanwhile
-            with torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"):
-                result = work()
-        except RuntimeError:
-            with suppress(RuntimeError, AttributeError):  # else torch's allocator keeps to the recording's memory
-                torch._C._cuda_endAllocateToPool(torch.cuda.current_device(), graph.pool())
-            raise
-        return graph.replay, result
+        return graph
+
+    def _recording(self, graph: torch.cuda.CUDAGraph) -> AbstractContextManager[None]:
+        """Other threads, such as the viewer's, may use the GPU meanwhile."""
+        return torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local")
 
 
 class NotRecordedError(RuntimeError):
@@ -230,7 +243,7 @@ class StepGraph:
             try:
                 self._replay, self._result = self._recorder.record(self._work)
             except (RuntimeError, AttributeError) as error:  # of CUDA; of a torch without what is called
-                raise NotRecordedError(last_line(error)) from error
+                raise NotRecordedError(first_line(error)) from error
         self._replay()
         return self._result
 

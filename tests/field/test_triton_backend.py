@@ -1,6 +1,8 @@
 """The kernels for GPUs, interpreted on the CPU: against the plain field; besides, few launches and no waits."""
 
+import gc
 import re
+import weakref
 from typing import Any
 
 import pytest
@@ -34,6 +36,22 @@ def test_values_and_gradients_evaluated_together_are_those_of_the_plain_field(co
         for a, b in zip(got, wanted, strict=True):
             assert a.shape == b.shape
             assert b.numel() == 0 or float((a - b).abs().max()) <= 1e-5 * max(float(b.abs().max()), 1.0)
+
+
+@pytest.mark.parametrize("last", [0, 9])
+def test_the_graph_of_a_step_goes_with_its_results(last: int) -> None:
+    """A cycle would keep its memory, and tie gradients to the stream on which it was made: no step could be recorded."""
+    field, p = make_field("triton"), points_around(20).float()
+    gc.collect()
+    gc.disable()
+    try:
+        f, slopes = field.sdf_and_last_gradients(p, 20 - last)
+        (f.sum() + slopes.sum()).backward()
+        left = weakref.ref(f), weakref.ref(slopes)
+        del f, slopes
+        assert left[0]() is None and left[1]() is None
+    finally:
+        gc.enable()
 
 
 def test_the_step_of_the_table_is_the_plain_one_and_clears_the_gradient() -> None:

@@ -69,7 +69,7 @@ def test_a_step_that_waits_is_not_recorded_and_training_goes_on(begin, capsys):
         training = begin("sl-neus-paper", partial(with_backend, "triton"))
 
         def record(work):
-            raise RuntimeError("first line\nthis GPU is too old")
+            raise RuntimeError("this GPU is too old\nCompile with TORCH_USE_CUDA_DSA to enable assertions")
 
         recorder = PretendedRecorder(gpu)
         recorder.record = record
