@@ -3,13 +3,15 @@
     python -m benchmarks.gpu [--scan FOLDER] [--device cpu --steps 2 --paper-steps 3 --default-steps 30] [--only NAME]
 
 In order of value: the kernels against double precision; times of a step and of the loop around it, waits and memory, of
-both methods with every backend, with and without a CUDA graph; recording beside a thread that uses the GPU; new
+both methods with every backend, with and without a CUDA graph; the kernels' shares of a step, and the least that the
+device's bandwidth and arithmetic allow; recording beside a thread that uses the GPU; a recording that fails; new
 recordings while levels are switched on; a training that goes on from its checkpoint against one in one go; whole
-trainings, with their surfaces against the truth, and against the same training on the CPU; the same step with
-nerfstudio's own encoding. A part that fails is written down with its error, and the next one begins; what there is no
-time for is left out by name; the file is written after each part. With `--device cpu` all of it runs without a GPU,
-except for what needs one. Without open3d, `--scan` is needed (one with its truth), and distances are those of the true
-surface's points from the field's zero, by its values and slopes.
+trainings, with their surfaces against the truth, and against the same training on the CPU; reading a photograph; what
+torch.compile makes of the plain field; the same step with nerfstudio's own encoding. A part that fails is written down
+with its error, and the next one begins; what there is no time for is left out by name; the file is written after each
+part. With `--device cpu` all of it runs without a GPU, except for what needs one. Without open3d, `--scan` is needed
+(one with its truth), and distances are those of the true surface's points from the field's zero, by its values and
+slopes.
 """
 
 import copy
@@ -21,24 +23,35 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+import cv2
+import numpy as np
 import torch
+from torch.profiler import ProfilerActivity, profile
+from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.common.iteration_step import SIZES, Ours, Theirs, softplus
 from benchmarks.common.measuring import describe, parsed
 from benchmarks.common.training import Training, model_of, settings
+from sl_nerfstudio.decoding.grid import GridImageDecoder
+from sl_nerfstudio.decoding.grid_networks import LoadedNetworks
 from sl_nerfstudio.errors import first_line
 from sl_nerfstudio.field.backend import BackendName
 from sl_nerfstudio.field.field import FieldConfig, SDFField
+from sl_nerfstudio.field.torch_backend import TorchField
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.model.run_files import checkpoints_in
 from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.pattern.files import read_layout
+from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.write import read_ground_truth
 
 METHODS = {"paper": "sl-neus-paper", "default": "sl-neus"}
@@ -92,8 +105,13 @@ def parts(config: Config, scan: Path) -> dict[str, Callable[[], dict[str, Any]]]
             for graph in (False, True) if there == "cuda" else (False,):
                 name = f"step {size} {backend}{' graph' if graph else ''}"
                 found[name] = partial(step_times, config, scan, size, backend, graph)
+    for size in METHODS:
+        found[f"bound {size}"] = partial(bound, config, scan, size)
     if there == "cuda":
+        for size in METHODS:
+            found[f"shares {size}"] = partial(shares, config, scan, size)
         found["beside a busy thread"] = partial(beside_a_busy_thread, config, scan)
+        found["failed recording"] = partial(failed_recording, config, scan)
         found["new recordings"] = partial(new_recordings, config, scan)
     for size in METHODS:
         found[f"resume {size}"] = partial(resumed, config, scan, size)
@@ -102,6 +120,9 @@ def parts(config: Config, scan: Path) -> dict[str, Callable[[], dict[str, Any]]]
         found[f"surface default {device}"] = partial(surface, config, scan, "default", device, config.default_steps)
     long = partial(surface, config, scan, "paper", there, config.paper_steps)
     found[f"surface paper {config.paper_steps} steps"] = long
+    found["decoding"] = partial(decoding, config, scan)
+    for size in METHODS:
+        found[f"compiled {size}"] = partial(compiled_step, config, scan, size)
     for size in SIZES:
         for name, make in encodings(there).items():
             found[f"encoding {size} {name}"] = partial(encoding_times, config, partial(make, SIZES[size]))
@@ -162,6 +183,59 @@ def step_times(config: Config, scan: Path, size: str, backend: BackendName, grap
     return {**found, "graph": training.trainer.recorded is not None, **_memory(config.device)}
 
 
+def bound(config: Config, scan: Path, size: str) -> dict[str, Any]:
+    """Least time of a step: its matrix products and the rows of the table that it touches, at the device's own speeds.
+
+    Rows as in benchmarks.iteration_time: four times 32 bytes each for values and gradients, seven for Adam.
+    """
+    source = torch.randn(1 << (28 if config.device == "cuda" else 24), device=config.device)
+    target, side = torch.empty_like(source), 8192 if config.device == "cuda" else 1024
+    a, b = torch.randn(side, side, device=config.device), torch.randn(side, side, device=config.device)
+    bandwidth = 2 * source.nbytes / _timed(lambda: target.copy_(source), 20, config.device)["best_ms"] * 1e3
+    speed = 2 * side**3 / _timed(lambda: torch.mm(a, b), 20, config.device)["best_ms"] * 1e3
+    backend: BackendName = "triton" if config.device == "cuda" else "torch"
+    training = begun(scan, size, config.device, 1000, backend, graph=False, adjust=False)
+    training.done = 601
+    training.before()
+    table = training.model.field.encoding.table
+    with FlopCounterMode(display=False) as counter:
+        _, terms, _ = training.pipeline.get_train_loss_dict(step=601)
+        torch.stack(list(terms.values())).sum().backward()
+    assert table.grad is not None
+    rows, flop = int((table.grad != 0).any(1).sum()), counter.get_total_flops()
+    products_ms, memory_ms = flop / speed * 1e3, rows * 32 * (4 + 7) / bandwidth * 1e3
+    return {
+        "tflops": round(speed / 1e12, 2), "bandwidth_gb": round(bandwidth / 1e9), "gflop": round(flop / 1e9, 2),
+        "rows": rows, "products_ms": round(products_ms, 3), "memory_ms": round(memory_ms, 3),
+    }  # fmt: skip
+
+
+def shares(config: Config, scan: Path, size: str) -> dict[str, Any]:
+    """Microseconds that each kernel takes in a step that is repeated by a CUDA graph, the longest ones by name."""
+    training = begun(scan, size, config.device, 1000, "auto", True, adjust=False)
+    training.done = 601
+    for _ in range(10):
+        training.step()
+    _wait(config.device)
+    with profile(activities=[ProfilerActivity.CUDA]) as seen:
+        for _ in range(_GROUPS):
+            training.step()
+        _wait(config.device)
+    rows = [(x.key[:80], round(x.device_time_total / _GROUPS, 1), x.count / _GROUPS) for x in seen.key_averages()]
+    rows = sorted((row for row in rows if row[1]), key=lambda row: -row[1])
+    return {"us": round(sum(row[1] for row in rows), 1), "launches": sum(row[2] for row in rows), "longest": rows[:30]}
+
+
+def compiled_step(config: Config, scan: Path, size: str) -> dict[str, Any]:
+    """`step_times` of the plain field, whose three functions torch compiles."""
+    names = ("evaluate", "pull_back", "pull_back_gradient")
+    plain = {name: getattr(TorchField, name) for name in names}
+    with ExitStack() as stack:
+        for name in names:
+            stack.enter_context(patch.object(TorchField, name, torch.compile(plain[name], dynamic=False)))
+        return step_times(config, scan, size, "torch", config.device == "cuda")
+
+
 def waits(turn: Callable[[], Any]) -> dict[str, int]:
     """Where the host waited for the GPU in ten turns of the loop, as torch notices it."""
     with warnings.catch_warnings(record=True) as caught:
@@ -172,7 +246,7 @@ def waits(turn: Callable[[], Any]) -> dict[str, int]:
                 turn()
         finally:
             torch.cuda.set_sync_debug_mode("default")
-    places = [f"{Path(x.filename).name}:{x.lineno}" for x in caught if "synchroniz" in str(x.message)]
+    places = [f"{Path(x.filename).name}:{x.lineno}" for x in caught if "called a synchronizing" in str(x.message)]
     return {place: places.count(place) for place in dict.fromkeys(places)}
 
 
@@ -210,7 +284,7 @@ def beside_a_busy_thread(config: Config, scan: Path) -> dict[str, Any]:
     def busy() -> None:
         while not stop.is_set() and not errors:
             try:
-                torch.rand(1 << 22, device="cuda").cpu()
+                torch.arange(1 << 22, device="cuda").cpu()  # random numbers are the recording's
                 torch.cuda.empty_cache()
             except RuntimeError as error:
                 errors.append(first_line(error))
@@ -224,6 +298,24 @@ def beside_a_busy_thread(config: Config, scan: Path) -> dict[str, Any]:
         stop.set()
         thread.join()
     return {"graph": training.trainer.recorded is not None, "errors_of_the_thread": errors}
+
+
+def failed_recording(config: Config, scan: Path) -> dict[str, Any]:
+    """Losses of steps of which none can be recorded, because they wait, and of the same steps on plain launches."""
+    losses = {}
+    for graph in (False, True):
+        training = begun(scan, "default", config.device, 1000, "auto", graph, adjust=False)
+        training.done, operations = 601, training.trainer._operations
+
+        def waiting(rates: Any, operations: Any = operations) -> Any:
+            torch.cuda.synchronize()
+            return operations(rates)
+
+        with patch.object(training.trainer, "_operations", waiting):
+            if graph:
+                training.trainer.record_steps(training.trainer.recorded[0]._recorder)
+            losses["waiting" if graph else "plain"] = [float(training.step()[0]) for _ in range(8)]
+    return {**losses, "graph": training.trainer.recorded is not None}
 
 
 def new_recordings(config: Config, scan: Path) -> dict[str, Any]:
@@ -266,6 +358,26 @@ def resumed(config: Config, scan: Path, size: str) -> dict[str, Any]:
 def _difference(one: torch.nn.Module, other: torch.nn.Module) -> float:
     pairs = [x for x in zip(one.parameters(), other.parameters(), strict=True) if x[0].numel()]
     return float(f"{max(float((a - b).abs().max() / a.abs().max().clamp_min(1e-30)) for a, b in pairs):.1e}")
+
+
+def decoding(config: Config, scan: Path) -> dict[str, Any]:
+    """Seconds of the networks that read photographs, for the pattern itself seen from the front, and what differs."""
+    pattern = read_layout(scan / "pattern.json")
+    image = cv2.imread(str(scan / "pattern.png"), cv2.IMREAD_GRAYSCALE)
+    assert isinstance(pattern, GridPattern) and image is not None
+    image = np.asarray(cv2.resize(image, (600, 600), interpolation=cv2.INTER_AREA), np.uint8)
+    found, coords = {}, []
+    devices: list[DeviceName] = ["cuda", "cpu"] if config.device == "cuda" else ["cpu"]
+    for device in devices:
+        decoder = GridImageDecoder(pattern, LoadedNetworks(device))
+        decoder.decode(image)  # what is loaded or compiled at first use
+        begin = time.perf_counter()
+        coords.append(decoder.decode(image).coords)
+        found[f"{device}_s"] = round(time.perf_counter() - begin, 3)
+    both = np.isfinite(coords[0][..., 0]) & np.isfinite(coords[-1][..., 0])
+    found["decoded"] = [round(float(np.isfinite(x[..., 0]).mean()), 5) for x in coords]
+    found["largest_difference_px"] = float(np.abs(coords[0][both] - coords[-1][both]).max())
+    return found
 
 
 def encoding_times(config: Config, make: Callable[[], Ours | Theirs]) -> dict[str, Any]:

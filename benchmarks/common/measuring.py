@@ -53,7 +53,10 @@ def describe() -> dict[str, str | int]:
     """Processor, cores, Python, torch, date and commit."""
     import torch
 
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    try:
+        commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
+    except FileNotFoundError:
+        commit = ""  # a machine without git
     return {
         "processor": _processor(), "cores": os.cpu_count() or 1, "python": platform.python_version(),
         "torch": torch.__version__, "date": date.today().isoformat(), "commit": commit,
