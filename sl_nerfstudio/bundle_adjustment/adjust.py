@@ -25,6 +25,7 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     free_parameters,
     linearise_with_intrinsics,
     prior_equations,
+    with_derivatives_along_surface,
     with_smooth_derivatives,
 )
 from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error, odds
@@ -122,11 +123,11 @@ def _result(explored: Explored, before: float) -> Adjustment:
     state, maps = found.state, problem.maps
     scene = state.rig, state.anchors, found.rows, maps
     exact = linearise_with_intrinsics(linearise(*scene), *scene)
-    smooth = with_smooth_derivatives(exact, *scene)
+    smooth, along = with_smooth_derivatives(exact, *scene), with_derivatives_along_surface(*scene)
     r = exact.residuals
     kernel = kernel_of(state, found.rows, found.widths, r)
     inliers = r.cross_valid & (r.cross.norm(dim=-1) < 4 * kernel.narrowest)
-    evidence = CovarianceEvidence(state.rig, state.anchors, found.rows, exact, smooth, kernel)
+    evidence = CovarianceEvidence(state.rig, state.anchors, found.rows, exact, smooth, along, kernel)
     free = free_parameters(explored.refine, state.rig)
     factor, intrinsics = pose_covariance(evidence, free, problem.start, problem.prior, found.noise)
     return Adjustment(

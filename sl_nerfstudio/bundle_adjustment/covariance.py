@@ -28,7 +28,12 @@ from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import Groups
-from sl_nerfstudio.bundle_adjustment.normal_equations import DepthCouplings, block_sums, normal_equations
+from sl_nerfstudio.bundle_adjustment.normal_equations import (
+    DepthCouplings,
+    NormalEquations,
+    block_sums,
+    normal_equations,
+)
 from sl_nerfstudio.bundle_adjustment.observations import Kernel
 from sl_nerfstudio.bundle_adjustment.parameters import (
     UNKNOWNS,
@@ -145,6 +150,7 @@ class CovarianceEvidence:
     rows: Observations
     linear: Linearisation
     smooth: Linearisation  # the same with derivatives of wide windows, where there are any
+    along: Linearisation  # the same with derivatives by the mean normals of all frames
     kernel: Kernel
 
     @property
@@ -298,7 +304,7 @@ def pose_covariance(
         poses_exact = torch.zeros(12 * n, UNKNOWNS, dtype=torch.float64)
         return torch.cat([poses_exact, prior.intrinsics_sigma.diag()]), None
     weights = e.kernel.weights(e.linear.residuals)
-    equations, smooth = (normal_equations(linear, e.rows, *weights) for linear in (e.linear, e.smooth))
+    equations, smooth, along = (normal_equations(x, e.rows, *weights) for x in (e.linear, e.smooth, e.along))
     g = torch.cat([equations.g.flatten(), equations.g_common])
     H_frames, g_frames = prior_equations(prior, start, e.rig)
     H_common = 1 / prior.intrinsics_sigma.clamp_min(_EXACT) ** 2  # of the prior, diagonal
@@ -310,13 +316,13 @@ def pose_covariance(
     curvature = max(e.kernel.curvature(e.linear.residuals), _LEAST_CURVATURE)
     spread = (blocks / max(free_blocks, 1.0)) ** 0.5 / curvature * columns
 
-    def moments(noise: float) -> tuple[Tensor, Tensor, Tensor]:
+    def moments(information: NormalEquations, noise: float) -> tuple[Tensor, Tensor, Tensor]:
         """Errors for a noise of one look-up, by the unknowns of each frame, then the intrinsics.
 
         A factor of the covariance for independent residuals; how much larger each sigma really is; the step that is
         left.
         """
-        factor = Cholesky.in_place(free.matrix(smooth.matrix(noise**2 * H_frames, noise**2 * H_common)))
+        factor = Cholesky.in_place(free.matrix(information.matrix(noise**2 * H_frames, noise**2 * H_common)))
         formal = noise * _increments(free, G, factor.root(unit_columns(rows, len(g))))
         caused = _together(spread, noise**2 * _prior_root(H_frames, H_common))
         pulls = torch.cat([caused, (g + noise**2 * g_prior)[:, None]], 1)
@@ -325,12 +331,12 @@ def pose_covariance(
         larger = (robust / formal.square().sum(1).clamp_min(1e-30)).clamp_min(1).sqrt()
         return formal, larger, -moved[:, -1]
 
-    formal, larger, step = moments(noise)
+    formal, larger, step = moments(smooth, noise)
     of_intrinsics = larger[12 * n :, None] * formal[12 * n :]
     calibration = SelfCalibration(step[12 * n :].clone(), of_intrinsics @ of_intrinsics.T)
     moves = (formal[: 12 * n] != 0).any(1)
     dependence = float(larger[: 12 * n][moves].median()) if moves.any() else 1.0
-    formal, larger, step = moments(dependence * noise)
+    formal, larger, step = moments(along, dependence * noise)
     return _by_kind(torch.cat([larger[:, None] * formal, step[:, None]], 1), n), calibration
 
 

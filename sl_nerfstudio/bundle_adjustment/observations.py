@@ -35,7 +35,7 @@ _ENTRIES_AT_ONCE = 2**28  # pairs of an anchor and a frame: bounds memory, to a 
 _TRIED_ANCHORS = 24  # of each frame, that show which frames see the same surface
 _LEAST_SHARED = 2  # of those, both ways, for two frames to be partners
 
-_STEP = 1e-3  # pixels, of differences that give normals
+_STEP = 0.05  # pixels to either side, of differences that give normals
 _LEAST_ALIKE = 0.7  # cosine between normals at the same place
 NOISE_FLOOR_PX = 0.01  # smallest plausible noise of one look-up, pattern pixels
 _FASTEST = 1.4  # largest factor by which a kernel narrows in one step
@@ -177,8 +177,9 @@ def _surface(
     p, good = _meet(rig, frame, uv, seen.uv_projector)
     edges = []
     for axis in range(2):
-        beside = uv + _STEP * torch.eye(2, dtype=uv.dtype)[axis]
-        edges.append(_meet(rig, frame, beside, seen.uv_projector + _STEP * seen.jacobian[..., axis])[0] - p)
+        step, change = _STEP * torch.eye(2, dtype=uv.dtype)[axis], _STEP * seen.jacobian[..., axis]
+        far = _meet(rig, frame, uv + step, seen.uv_projector + change)[0]
+        edges.append(far - _meet(rig, frame, uv - step, seen.uv_projector - change)[0])
     normal = torch.nn.functional.normalize(torch.linalg.cross(edges[0], edges[1]), dim=-1)
     return p, -normal * (normal * p).sum(-1, keepdim=True).sign(), good
 

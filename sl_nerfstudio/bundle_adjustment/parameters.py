@@ -15,7 +15,8 @@ from numpy import ndarray
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import WIDE_HALF_WINDOW, CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, Rig, linearise
+from sl_nerfstudio.bundle_adjustment.observations import with_common_normals
+from sl_nerfstudio.bundle_adjustment.residuals import OWN_PLACE_PX, Anchors, Linearisation, Observations, Rig, linearise
 from sl_nerfstudio.geometry.devices import UNCHANGED, Intrinsics, IntrinsicsChange, project, project_jacobian
 from sl_nerfstudio.geometry.lie import (
     Similarity,
@@ -410,8 +411,13 @@ def linearise_with_intrinsics(
     )
     uv_camera = project(rig.camera[j], p_j)[0]
     seen = maps.look_up(j, uv_camera, observations.memory)
-    move_world = (rig.T_world_camera[i, :3, :3] @ move)[a]
-    by_camera = linear.cross[..., :3] @ move_world - seen.jacobian @ by_intrinsics(rig.camera[j], uv_camera)
+    move_world = rig.T_world_camera[i, :3, :3] @ move
+    # The point's pixel moves in the other image: what was decoded there is the view of a point beside, on the surface.
+    ray_j = rig.camera[j]
+    K_j = project_jacobian(ray_j, p_j)
+    beside = K_j.transpose(1, 2) @ torch.linalg.solve(K_j @ K_j.transpose(1, 2), by_intrinsics(ray_j, uv_camera))
+    from_surface = linear.cross[..., :3] @ (move_world[a] + rig.T_world_camera[j, :3, :3] @ beside)
+    by_camera = from_surface + linear.cross[..., 12:15] @ beside  # that part is minus the derivative by the point alone
     by_projector = by_intrinsics(rig.projector, linear.residuals.cross + seen.uv_projector)
     return replace(
         linear,
@@ -442,3 +448,11 @@ def with_smooth_derivatives(
         cross=torch.where(fits[:, None, None], found.cross, linear.cross),
         cross_depth=torch.where(fits[:, None], found.cross_depth, linear.cross_depth),
     )
+
+
+def with_derivatives_along_surface(
+    rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps
+) -> Linearisation:
+    """Residuals with the derivatives that the surface's normals give, which are the means of all frames that see it."""
+    scene = rig, with_common_normals(rig, anchors, observations, maps), observations, maps
+    return linearise_with_intrinsics(linearise(*scene, OWN_PLACE_PX), *scene)

@@ -195,7 +195,8 @@ class CudaRecorder:
                 warnings.simplefilter("ignore")
                 with self._recording(self._graph()):  # else random numbers remain those of a recording
                     pass
-            raise RuntimeError(first_line(error.__context__ or error)) from error  # the cause, not that it cannot end
+            before = error.__context__  # the cause; the error itself may say that a recording cannot end
+            raise RuntimeError(first_line(before if isinstance(before, Exception) else error)) from error
         return graph.replay, result
 
     def _graph(self) -> torch.cuda.CUDAGraph:

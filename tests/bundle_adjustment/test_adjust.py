@@ -210,16 +210,16 @@ def noisy_maps(seed: int, noise: float, size: int = SIZE) -> CoordinateMaps:
 def test_frames_that_slide_on_a_plane_have_a_sigma_that_covers_their_error(monkeypatch):
     """With what other searches find it is larger. The question can be asked later, and changes no pose."""
     monkeypatch.setattr(analytic, "BALLS", ())
-    true, maps = rig_of(FEW, SIZE), noisy_maps(1, 0.02)
-    one = find_minimum(disturbed(true, 1), maps, TIGHT, "known-rig", SEVERAL)
+    true, maps = rig_of(FEW, SIZE), noisy_maps(0, 0.02)
+    one = find_minimum(disturbed(true, 0), maps, TIGHT, "known-rig", SEVERAL)
     several = with_other_minima(one)
     assert torch.equal(one.rig.T_world_camera, several.rig.T_world_camera) and several.explored is None
     assert with_other_minima(several) is several
     error = departure_of(true, one.rig)[: 6 * FEW]
     rms = [float((error / f.covariance.diagonal()[: 6 * FEW].sqrt()).pow(2).mean().sqrt()) for f in (one, several)]
-    assert rms[1] < rms[0] and rms[1] < 1.5
+    assert rms[1] < rms[0] < 1.5
     assert float((several.sigma / one.sigma)[:, :6].max()) > 1.5
-    unasked = with_other_minima(find_minimum(disturbed(true, 1), maps, TIGHT, "known-rig", ONE))
+    unasked = with_other_minima(find_minimum(disturbed(true, 0), maps, TIGHT, "known-rig", ONE))
     assert torch.equal(unasked.factor, one.factor)
 
 
@@ -235,9 +235,9 @@ def searches(monkeypatch) -> list:
 @pytest.mark.slow
 def test_a_scene_that_holds_its_frames_is_searched_once(searches):
     size = 240
-    maps = noisy_maps(2, 0.3, size)
+    maps = noisy_maps(1, 0.3, size)
     one = find_minimum(
-        disturbed(rig_of(FEW, size), 2), maps, TIGHT, "known-rig", replace(SEVERAL, anchors_per_frame=300)
+        disturbed(rig_of(FEW, size), 1), maps, TIGHT, "known-rig", replace(SEVERAL, anchors_per_frame=300)
     )
     assert torch.equal(one.factor, with_other_minima(one).factor) and len(searches) == 1
 

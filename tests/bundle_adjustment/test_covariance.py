@@ -116,7 +116,7 @@ def by_inverses(
     n, weights = e.rig.frames, e.kernel.weights(e.linear.residuals)
     size = 12 * n + UNKNOWNS
     equations = normal_equations(e.linear, e.rows, *weights)
-    H_data = without_prior(normal_equations(e.smooth, e.rows, *weights))
+    smooth, along = (without_prior(normal_equations(x, e.rows, *weights)) for x in (e.smooth, e.along))
     H_frames, g_frames = prior_equations(prior, start, e.rig)
     weight = 1 / prior.intrinsics_sigma**2
     H_prior, g_prior = torch.block_diag(*H_frames, weight.diag()), torch.cat([g_frames.flatten(), torch.zeros(6)])
@@ -130,7 +130,7 @@ def by_inverses(
     assert n < blocks <= e.blocks == columns.shape[1]
     curvature = max(e.kernel.curvature(e.linear.residuals), covariance._LEAST_CURVATURE)
 
-    def moments(noise: float) -> tuple[Tensor, Tensor, Tensor]:
+    def moments(H_data: Tensor, noise: float) -> tuple[Tensor, Tensor, Tensor]:
         H = B.T @ (H_data + noise**2 * H_prior) @ B
         C = P @ B @ torch.linalg.inv(H) @ B.T
         left = max(blocks - len(H), blocks / 4)
@@ -140,11 +140,11 @@ def by_inverses(
         larger = (robust / formal.diagonal().clamp_min(1e-30)).clamp_min(1).sqrt()
         return formal, larger, -C @ (g + noise**2 * g_prior)
 
-    formal, larger, step = moments(noise)
+    formal, larger, step = moments(smooth, noise)
     own = torch.outer(larger, larger) * formal
     calibration = SelfCalibration(step[-UNKNOWNS:], own[-UNKNOWNS:, -UNKNOWNS:])
     moves = formal.diagonal()[:-UNKNOWNS] > 1e-25
-    formal, larger, step = moments(float(larger[:-UNKNOWNS][moves].median()) * noise)
+    formal, larger, step = moments(along, float(larger[:-UNKNOWNS][moves].median()) * noise)
     return matrix_by_kind(torch.outer(larger, larger) * formal + torch.outer(step, step), n), calibration
 
 
