@@ -14,7 +14,8 @@ captures say about the intrinsics is reported with the first.
 Two things make a normal matrix too large. Weights of a robust kernel are not its second derivative
 (`Kernel.curvature`). And derivatives by the poses hold slopes of the decoded maps, whose errors add up in it as
 squares: along directions of which residuals know little, they outweigh what is there ("errors in variables"). So its
-slopes are those of wide windows.
+derivatives are by the surface's normals, the means of all frames that see a place. Those are a little blind to wrong
+intrinsics, of which derivatives by the slopes of wide windows tell instead.
 """
 
 from dataclasses import dataclass
