@@ -48,6 +48,7 @@ from sl_nerfstudio.field.backend import BackendName
 from sl_nerfstudio.field.field import FieldConfig, SDFField
 from sl_nerfstudio.field.torch_backend import TorchField
 from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.model.loop import CudaRecorder
 from sl_nerfstudio.model.run_files import checkpoints_in
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.pattern.files import read_layout
@@ -313,7 +314,7 @@ def failed_recording(config: Config, scan: Path) -> dict[str, Any]:
 
         with patch.object(training.trainer, "_operations", waiting):
             if graph:
-                training.trainer.record_steps(training.trainer.recorded[0]._recorder)
+                training.trainer.record_steps(CudaRecorder([training.pipeline.datamanager.train_pixel_sampler.generator]))
             losses["waiting" if graph else "plain"] = [float(training.step()[0]) for _ in range(8)]
     return {**losses, "graph": training.trainer.recorded is not None}
 

@@ -40,7 +40,7 @@ def test_values_and_gradients_evaluated_together_are_those_of_the_plain_field(co
 
 @pytest.mark.parametrize("last", [0, 9])
 def test_the_graph_of_a_step_goes_with_its_results(last: int) -> None:
-    """A cycle would keep its memory, and tie gradients to the stream on which it was made: no step could be recorded."""
+    """A cycle would keep its memory, and tie gradients to the stream where it was made: no step could be recorded."""
     field, p = make_field("triton"), points_around(20).float()
     gc.collect()
     gc.disable()
