@@ -15,6 +15,7 @@ slopes.
 """
 
 import copy
+import gc
 import json
 import statistics
 import tempfile
@@ -321,6 +322,7 @@ def failed_recording(config: Config, scan: Path) -> dict[str, Any]:
 
 def new_recordings(config: Config, scan: Path) -> dict[str, Any]:
     """Steps of a short training that took far longer than the others, and the memory at its end."""
+    _forget_memory(config.device)
     training = begun(scan, "default", config.device, 120, "auto", True, adjust=False)
     slow = []
     for step in range(140):
@@ -482,6 +484,7 @@ def _wait(device: str) -> None:
 
 
 def _forget_memory(device: str) -> None:
+    gc.collect()  # trainings before, which hold themselves
     if device == "cuda":
         torch.cuda.empty_cache()
         torch.cuda.reset_peak_memory_stats()
