@@ -315,7 +315,9 @@ def failed_recording(config: Config, scan: Path) -> dict[str, Any]:
 
         with patch.object(training.trainer, "_operations", waiting):
             if graph:
-                training.trainer.record_steps(CudaRecorder([training.pipeline.datamanager.train_pixel_sampler.generator]))
+                training.trainer.record_steps(
+                    CudaRecorder([training.pipeline.datamanager.train_pixel_sampler.generator])
+                )
             losses["waiting" if graph else "plain"] = [float(training.step()[0]) for _ in range(8)]
     return {**losses, "graph": training.trainer.recorded is not None}
 

@@ -55,7 +55,7 @@ SPREAD_COUNT = 4.0  # turns that this spread counts as
 LARGEST_STEP_DEG = 40.0  # of someone who walks around an object
 NO_ORDER_DEG = 25.0  # spread of the turns of frames in no order that see a common surface
 SMALL_STEP_DEG = 10.0  # of steps that surfaces allow alike smaller ones are likelier: scale of their distribution
-ORDER_ODDS = 1.0  # nats by which frames in no order must be likelier: photographs are numbered as they are taken
+ORDER_ODDS = 5.0  # nats by which an order must be likelier than none: sets in order have 12 to 45, others -6 to 0
 LEAST_LIKELIHOOD = 1e-300  # so that what nothing explains has a logarithm
 STEP_STARTS, STEP_ROUNDS = 80, 12  # of the search for the usual step
 LARGEST_GAP = 2  # between frames by which the usual step is learnt
@@ -309,7 +309,7 @@ class ViewGraph:
         turns = Turns.of(pairs)
         (step, odds), (_, without) = likeliest_step(turns), likeliest_step(turns.in_no_order())
         usual = step.rms_deg <= LARGEST_STEP_DEG and turns.probability(step).mean() >= LEAST_STEPS
-        if usual and without <= odds + ORDER_ODDS:
+        if usual and odds >= without + ORDER_ODDS:
             self.step = step
 
     def usual_step(self, i: int, j: int, S_i_j: Similarity) -> float:
