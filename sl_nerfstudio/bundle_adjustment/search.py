@@ -236,13 +236,11 @@ def along_surface(problem: SearchProblem, refine: RefinePoses, found: SearchProg
 
     There the noise of slopes looks like information, so steps by the slopes of single look-ups are a hundredth of what
     they should be. These are by the surface's normals, but the last ones: details of the surface that are smaller than
-    the windows of normals show in single look-ups alone. Kernels begin as wide as those look-ups may err: a surface
-    that has slid by more than its noise disagrees at its edges alone, which the search before has given up.
+    the windows of normals show in single look-ups alone.
     """
     here = problem_of(problem.start, problem.maps, problem.prior, problem.settings, found.state.rig)
     state = LMState(found.state.rig, here.anchors, DAMPING)
-    widths = torch.full_like(found.widths, OWN_PLACE_PX)
-    found = replace(found, state=state, rows=here.observe(state), widths=widths)
+    found = replace(found, state=state, rows=here.observe(state))
     steps = problem.settings.max_iterations
     found = run_stage(here, SearchStage(refine, True, steps, OWN_PLACE_PX), found)
     found = _away_from_borders(here, found)

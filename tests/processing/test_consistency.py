@@ -215,7 +215,7 @@ def test_pairs_of_a_frame_that_was_placed_are_used_if_they_say_the_same(clouds):
 def test_other_minima_are_searched_for_once_and_the_last_group_states_what_they_show(monkeypatch):
     """On a plane along which frames slide; a stranger among them makes two adjustments of it."""
     monkeypatch.setattr(analytic, "BALLS", ())
-    clouds, starts = with_stranger(clouds_of(RIG, SIZE, noise=0.02)), []
+    clouds, starts = with_stranger(clouds_of(RIG, SIZE, noise=0.05)), []
     search = adjustment.search
     for module in (adjustment, modes):
         monkeypatch.setattr(module, "search", lambda problem, *rest: starts.append(problem) or search(problem, *rest))
@@ -228,7 +228,7 @@ def test_other_minima_are_searched_for_once_and_the_last_group_states_what_they_
     alone = find_registered_minimum(clouds, found.registration, QUICK).frames
     np.testing.assert_array_equal(found.adjusted.poses.T_world_camera, wanted.poses.T_world_camera)
     assert found.adjusted.sigma == wanted.sigma
-    assert max(found.adjusted.sigma[k].camera_translation / alone.sigma[k].camera_translation for k in kept) > 1.5
+    assert max(found.adjusted.sigma[k].camera_translation / alone.sigma[k].camera_translation for k in kept) > 1.2
 
 
 def registration_gaps(registration: Registration) -> list[int]:
