@@ -51,7 +51,7 @@ from sl_nerfstudio.field.torch_backend import TorchField
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.model.loop import CudaRecorder
 from sl_nerfstudio.model.run_files import checkpoints_in
-from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.parallel import DeviceName, one_library_thread
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.write import read_ground_truth

@@ -1,5 +1,7 @@
 """Residuals vanish at the truth, derivatives are those of the residuals, and the gauge is free."""
 
+from collections.abc import Callable
+
 import pytest
 import torch
 
@@ -7,7 +9,7 @@ from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import observe, place_anchors
 from sl_nerfstudio.bundle_adjustment.parameters import gauge_directions
-from sl_nerfstudio.bundle_adjustment.residuals import OWN_PLACE_PX, Anchors, Rig, linearise, residuals_of
+from sl_nerfstudio.bundle_adjustment.residuals import OWN_PLACE_PX, Anchors, Linearisation, Rig, linearise, residuals_of
 from sl_nerfstudio.geometry.lie import transform
 
 from .analytic import ExactMaps, cast, dense, disturbed, images_of, rig_of
@@ -47,22 +49,16 @@ def moved(rig: Rig, which: int, frames: slice, index: int, step: float) -> Rig:
     return rig.moved(x[0], x[1])
 
 
-def test_jacobians_are_central_differences_of_the_residuals(scene):
-    """At a disturbed rig. A window's paraboloid is the same throughout its pixel, so the derivative is exact there."""
-    true, maps, anchors, observations = scene
-    rig = disturbed(true, 3, degrees=0.3, shift=0.01, relative=0.5)
-    linear = linearise(rig, anchors, observations, maps)
-    ok = linear.residuals.cross_valid
-    assert ok.sum() > 150
+Agrees = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], None]
+
+
+def require_derivatives(rig: Rig, scene: tuple, linear: Linearisation, ok: torch.Tensor, agrees: Agrees) -> None:
+    """All derivatives against central differences; `ok`: of which look-ups."""
+    maps, anchors, observations = scene
 
     def difference(plus: Rig, minus: Rig, a: Anchors = anchors, b: Anchors = anchors):
         r, s = residuals_of(plus, a, observations, maps), residuals_of(minus, b, observations, maps)
         return (r.own - s.own) / (2 * STEP), (r.cross - s.cross) / (2 * STEP)
-
-    def agrees(found: torch.Tensor, expected: torch.Tensor, rows: torch.Tensor) -> None:
-        scale = float(expected[rows].abs().max().clamp_min(1.0))
-        error = ((found - expected)[rows].abs() / scale).amax(-1)
-        assert (error > 1e-6).sum() <= 2  # a position may cross into the next pixel within the step
 
     every = torch.ones(len(anchors.frame), dtype=torch.bool)
     own, cross = difference(rig, rig, anchors.at(anchors.depth + STEP), anchors.at(anchors.depth - STEP))
@@ -82,6 +78,22 @@ def test_jacobians_are_central_differences_of_the_residuals(scene):
             _, cross = difference(*(moved(rig, 1, one, k, s * STEP) for s in (1, -1)))
             expected = torch.where((j == frame)[:, None], linear.cross[..., 12 + k], torch.zeros_like(cross))
             agrees(cross, expected, ok)
+
+
+def test_jacobians_are_central_differences_of_the_residuals(scene):
+    """At a disturbed rig. A window's paraboloid is the same throughout its pixel, so the derivative is exact there."""
+    true, maps, anchors, observations = scene
+    rig = disturbed(true, 3, degrees=0.3, shift=0.01, relative=0.5)
+    linear = linearise(rig, anchors, observations, maps)
+    ok = linear.residuals.cross_valid
+    assert ok.sum() > 150
+
+    def agrees(found: torch.Tensor, expected: torch.Tensor, rows: torch.Tensor) -> None:
+        scale = float(expected[rows].abs().max().clamp_min(1.0))
+        error = ((found - expected)[rows].abs() / scale).amax(-1)
+        assert (error > 1e-6).sum() <= 2  # a position may cross into the next pixel within the step
+
+    require_derivatives(rig, (maps, anchors, observations), linear, ok, agrees)
 
 
 @pytest.mark.parametrize("projector", ["pinhole", "DOE"])
@@ -95,33 +107,12 @@ def test_derivatives_by_normals_are_central_differences_at_the_truth(projector):
     ok = linear.residuals.cross_valid & (linear.residuals.cross.norm(dim=-1) < 1e-6)
     assert ok.sum() > 150
 
-    def difference(plus: Rig, minus: Rig, a: Anchors = anchors, b: Anchors = anchors):
-        r, s = residuals_of(plus, a, observations, maps), residuals_of(minus, b, observations, maps)
-        return (r.own - s.own) / (2 * STEP), (r.cross - s.cross) / (2 * STEP)
-
     def agrees(found: torch.Tensor, expected: torch.Tensor, rows: torch.Tensor) -> None:
         scale = float(expected[rows].abs().max().clamp_min(1.0))
         error = ((found - expected)[rows].abs() / scale).amax(-1)
         assert error.max() < 3e-4
 
-    every = torch.ones(len(anchors.frame), dtype=torch.bool)
-    own, cross = difference(rig, rig, anchors.at(anchors.depth + STEP), anchors.at(anchors.depth - STEP))
-    agrees(own, linear.own_depth, every)
-    agrees(cross, linear.cross_depth, ok)
-    i, j = anchors.frame[observations.anchor], observations.frame
-    for k in range(6):
-        own, _ = difference(*(moved(rig, 1, slice(None), k, s * STEP) for s in (1, -1)))
-        agrees(own, linear.own[..., k], every)
-        for frame in (0, FRAMES - 1):
-            one = slice(frame, frame + 1)
-            own, cross = difference(*(moved(rig, 0, one, k, s * STEP) for s in (1, -1)))
-            assert torch.equal(own, torch.zeros_like(own))
-            expected = torch.where((i == frame)[:, None], linear.cross[..., k], torch.zeros_like(cross))
-            expected = torch.where((j == frame)[:, None], linear.cross[..., 6 + k], expected)
-            agrees(cross, expected, ok)
-            _, cross = difference(*(moved(rig, 1, one, k, s * STEP) for s in (1, -1)))
-            expected = torch.where((j == frame)[:, None], linear.cross[..., 12 + k], torch.zeros_like(cross))
-            agrees(cross, expected, ok)
+    require_derivatives(rig, (maps, anchors, observations), linear, ok, agrees)
 
 
 def test_the_gauge_and_nothing_else_is_free(scene):
