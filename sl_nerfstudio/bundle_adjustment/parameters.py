@@ -383,7 +383,11 @@ class SelfCalibration:
     @property
     def chi_square(self) -> float:
         """Squared length of the change in units of its uncertainty: about six if the intrinsics are correct."""
-        return float(self.change @ torch.linalg.solve(self.covariance, self.change))
+        return self.squared_length(self.change)
+
+    def squared_length(self, change: Float[Tensor, "6"]) -> float:
+        """Squared length of any change in units of this uncertainty."""
+        return float(change @ torch.linalg.solve(self.covariance, change))
 
     def contradicts(self) -> bool:
         """Whether the captures show that the stated intrinsics are wrong."""

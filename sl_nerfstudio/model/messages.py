@@ -40,8 +40,10 @@ def refine_intrinsics(
     """Change the intrinsics if the captures contradict them, adjusting all poses with each change.
 
     `loaded` holds the scan with the intrinsics of its folder, `stated` a change that is already known. Intrinsics that
-    the captures do not contradict remain unchanged. Gauss-Newton steps are taken while the chi square of the
-    contradiction falls; held-out pixels then decide once between the first result and the last.
+    the captures do not contradict remain unchanged. Gauss-Newton steps are taken while they become shorter, by the same
+    covariance: chi square itself may rise, as better intrinsics leave less noise (natural monotonicity: Deuflhard,
+    Newton Methods for Nonlinear Problems, section 2.1). Held-out pixels then decide once between the first result and
+    the last.
     """
     maps, held_out = maps_and_held_out(loaded.scan, loaded.samples)
     once = replace(settings, other_minima=False)  # poses are adjusted again later
@@ -59,7 +61,8 @@ def refine_intrinsics(
             break
         proposed = change + IntrinsicsChange.of(after.intrinsics.change.tolist())
         found = adjusted_with(proposed)
-        if found.intrinsics is None or found.intrinsics.chi_square >= after.intrinsics.chi_square:
+        left = found.intrinsics
+        if left is None or left.chi_square >= left.squared_length(after.intrinsics.change):
             break
         change, after = proposed, found
     # That the captures contradict the stated intrinsics is known already: any gain beyond chance confirms it.

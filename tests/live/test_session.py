@@ -61,7 +61,7 @@ def test_a_session_that_was_interrupted_gives_the_same_scan(whole, tmp_path, cut
     resumed, updates = scan(tmp_path / "live", FakeSource(WALK))
     assert len(updates) == len(WALK) - cut
     assert without_seconds(resumed.rows) == without_seconds(whole[0].rows)
-    np.testing.assert_array_equal(resumed.poses, whole[0].poses)
+    np.testing.assert_allclose(resumed.poses, whole[0].poses, rtol=0, atol=1e-11)  # sums of several threads
     files = [sorted(path.name for path in s.captures.glob("*.png")) for s in (resumed, whole[0])]
     assert files[0] == files[1]
 
