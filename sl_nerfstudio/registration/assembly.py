@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.evidence import Comparison, ScanEvidence
+from sl_nerfstudio.registration.evidence import MOST_OF_A_PAIR, Comparison, ScanEvidence
 from sl_nerfstudio.registration.pairs import (
     LEAST_ODDS,
     SAME_PLACE_DEG,
@@ -29,7 +29,6 @@ MOST_COMPARED = 12  # clearly different similarities between two components
 MOST_PAIRS = 10  # of frames across two components that are compared
 MOST_ALIKE = 4  # frames that each faces at a place, by which blocks of what looks alike are found
 ADJUSTED_DEG = 6.0  # between two places, up to which the joint adjustment leads from one to the other
-MOST_AGAINST = 40.0  # nats that a pair says against a place that it does not know
 BASELINE_SIGMA = 0.5  # of the logarithm of a ratio of baselines: nobody moves two devices much farther apart
 LARGEST_BASELINE = 5.0  # such a ratio, beyond which a surface has collapsed onto a patch of another
 LEAST_SIGHT_COSINE = float(np.cos(np.radians(75.0)))  # between lines of sight: beyond it frames share no surface
@@ -258,7 +257,7 @@ class Assembly:
         degree = {k: max(count[k] for count in counts) for k in set().union(*counts)}
         for i, j in sorted(set().union(*near)):
             here = [relative(at, j, i) if see_same_side(at[i], at[j]) else None for at in nodes]
-            found += self._scan.comparison(j, i, here).scaled(2 / (degree[i] + degree[j]))
+            found += self._scan.comparison(j, i, here).bounded().scaled(2 / (degree[i] + degree[j]))
         found += self._by_tone(first, second, nodes)
         found += by_odds([self._usual_baselines(first, second, at) for at in nodes])
         return replace(found, alike=found.alike | alike)
@@ -295,7 +294,7 @@ class Assembly:
                 said += LEAST_ODDS
             else:
                 contradicted = replace(found, alike=np.ones((2, 2), dtype=bool)).leads[0, 1]
-                said -= min(abs(float(contradicted)), MOST_AGAINST)
+                said -= min(abs(float(contradicted)), MOST_OF_A_PAIR)
         return said > 0
 
     def gains_among_alike(self, nodes: Component, turn: Similarity) -> Float64[ndarray, "m m"]:
@@ -317,7 +316,7 @@ class Assembly:
             i, j = nodes[frames[a]], nodes[frames[b]]
             worlds = ((i, j), (turn @ i, j), (i, turn @ j))
             places = [q.inverse() @ p if see_same_side(p, q) else None for p, q in worlds]
-            found = self._scan.comparison(frames[a], frames[b], places)
+            found = self._scan.comparison(frames[a], frames[b], places).bounded()
             leads = replace(found, alike=np.ones((3, 3), dtype=bool)).leads * 2 / (degree[a] + degree[b])
             gain[a, b], gain[b, a] = leads[1, 0], leads[2, 0]
         return gain

@@ -18,14 +18,14 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.assembly import ADJUSTED_DEG, LARGEST_BASELINE, MOST_AGAINST, Assembly, Elsewhere
-from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_TURN_DEG, TONE_ODDS, PairMatch
+from sl_nerfstudio.registration.assembly import ADJUSTED_DEG, LARGEST_BASELINE, Assembly, Elsewhere
+from sl_nerfstudio.registration.evidence import MOST_OF_A_PAIR
+from sl_nerfstudio.registration.pairs import LEAST_ODDS, LEAST_SIDE_DEG, SAME_TURN_DEG, TONE_ODDS, PairMatch
 from sl_nerfstudio.registration.pose_graph import Component, optimise_at_places, optimise_known
 
 MOST_TURNS = 48  # of the world that are tried
 MOST_MOVES = 12  # of blocks, one after the other
 LEAST_GAIN = 1.0  # nats by which a block must fit better elsewhere to be moved
-LEAST_SIDE_DEG = 12.0  # between two sides of an object, or teeth of a gear; closer places are slides along a surface
 STARTS = 24  # frames from which a block is grown
 
 
@@ -229,7 +229,7 @@ class BlockReview:
                 if e.by_tone:
                     surface[moved, kept] += weight * TONE_ODDS * (float(there is not None) - float(here is not None))
                 elif not alike:
-                    before, after = (-MOST_AGAINST if odds is None else odds for odds in (here, there))
+                    before, after = (-MOST_OF_A_PAIR if odds is None else odds for odds in (here, there))
                     surface[moved, kept] += weight * (after - before)
         if self._prior is not None:
             for i, j, back, usual in ordered:
@@ -257,7 +257,7 @@ def turns_said(edges: Sequence[PairMatch], nodes: Component) -> list[Similarity]
     for e in edges:
         target, source = nodes[e.target], nodes[e.source].inverse()
         here = e.log_odds_at(target.inverse() @ nodes[e.source])
-        here = -MOST_AGAINST if here is None else here
+        here = -MOST_OF_A_PAIR if here is None else here
         for one in e.places:
             turn, gain = target @ one.S_target_source @ source, one.log_odds - here
             said += [(gain, turn), (gain, turn.inverse())]

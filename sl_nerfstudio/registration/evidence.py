@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int8, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int8, Int64
 from numpy import ndarray
 from scipy.ndimage import uniform_filter
 from scipy.spatial.transform import Rotation
@@ -72,6 +72,7 @@ LEAST_SEEN = 0.3  # points that a place must let be judged, relative to the plac
 LEAST_AGREEING = 0.7  # of those that it lets be judged, for a place to be such a measure
 LEAST_ODDS = 10.0  # nats that decide: errors of the decoder that pixels share make wrong places lead by a few
 LARGEST_LEAD = 1e6  # nats: of the only place
+MOST_OF_A_PAIR = 40.0  # nats that one pair of frames says for or against a place
 
 NEAR_THINNED = 3  # only each so-manieth point is used to find the most likely place close to one
 NEAR_WIDTHS = (10.0, 7.0, 5.0, 4.0)  # of the kernel on the way there, sigmas
@@ -542,6 +543,13 @@ class Comparison:
             self.shared + other.shared, self.own + other.own, self.odds + other.odds, self.alike | other.alike
         )
 
+    def bounded(self) -> "Comparison":
+        """As far as two frames can be believed: one of them may be wrong itself, by a wrong pose of its projector."""
+        shared, own, odds = (
+            np.clip(each, -MOST_OF_A_PAIR, MOST_OF_A_PAIR) for each in (self.shared, self.own, self.odds)
+        )
+        return Comparison(shared, own, odds, self.alike)
+
     def scaled(self, weight: float) -> "Comparison":
         """Of evidence that counts less."""
         return Comparison(weight * self.shared, weight * self.own, weight * self.odds, self.alike)
@@ -551,6 +559,15 @@ class Comparison:
         """Places of which nothing is known."""
         shared, own = np.zeros((2, count, count))
         return Comparison(shared, own, np.zeros(count), np.zeros((count, count), dtype=bool))
+
+
+def together(seen: Float[ndarray, "*size"], absent: Float[ndarray, "*size"]) -> Float64[ndarray, "*size"]:
+    """What points that are seen and points that are absent say, in all.
+
+    Whatever hides a surface and was not decoded itself, such as the dark side of a wall, hides many points at once:
+    together they are as unlikely as one.
+    """
+    return seen.astype(np.float64) + np.maximum(absent, np.log(ABSENT_SHARE))
 
 
 class PairEvidence:
@@ -648,25 +665,32 @@ class PairEvidence:
 
     def log_odds(self, found: Compared, common: tuple[Commonness, Commonness]) -> Float64[ndarray, "k"]:
         """Log-likelihood of each place, against that of the same points elsewhere, in nats."""
-        return (self._against_elsewhere(found, common) / self.area).sum(1)
+        return together(*(part.sum(1) for part in self._against_elsewhere(found, common)))
 
-    def _against_elsewhere(self, found: Compared, common: tuple[Commonness, Commonness]) -> Float64[ndarray, "k n"]:
+    def _against_elsewhere(
+        self, found: Compared, common: tuple[Commonness, Commonness]
+    ) -> tuple[Float32[ndarray, "k n"], Float32[ndarray, "k n"]]:
+        """What each point that is seen says of each place, and each that is absent."""
         share = np.concatenate([c.share for c in common]).astype(np.float32)
         gone = np.concatenate([np.full(len(c.fits), c.absent_share) for c in common])
         p, other = found.density, density_elsewhere(found.z)
         seen = np.log(p / (share * p + (1 - share) * other)) + np.log((1 - ABSENT_SHARE) / (1 - gone))
-        absent = np.log(ABSENT_SHARE / gone)
-        return np.where(found.codes == JUDGED, seen, np.where(found.codes == ABSENT, absent, 0))
+        return self._by_code(found, seen, np.log(ABSENT_SHARE / gone))
+
+    def _by_code(
+        self, found: Compared, seen: ndarray, absent: ndarray | np.floating
+    ) -> tuple[Float32[ndarray, "k n"], Float32[ndarray, "k n"]]:
+        here, gone = found.codes == JUDGED, found.codes == ABSENT
+        each = np.where(here, seen / self.area, 0), np.where(gone, absent / self.area, 0)
+        return each[0].astype(np.float32), each[1].astype(np.float32)
 
     def comparison(self, found: Compared, common: tuple[Commonness, Commonness]) -> "Comparison":
         """Compare each place with each other."""
-        known = (found.codes == JUDGED) | (found.codes == ABSENT)
-        each = np.where(found.codes == ABSENT, np.log(ABSENT_SHARE), found.contrast)
-        J = known.astype(np.float32)
-        alone = (self._against_elsewhere(found, common) / self.area).astype(np.float32)
-        L = np.where(known, each / self.area, 0).astype(np.float32)
-        shared = (L @ J.T).astype(np.float64)
-        odds, own = alone.sum(1).astype(np.float64), (alone @ (1 - J).T).astype(np.float64)
+        J = ((found.codes == JUDGED) | (found.codes == ABSENT)).astype(np.float32)
+        alone = self._against_elsewhere(found, common)
+        each = self._by_code(found, found.contrast, np.log(ABSENT_SHARE))
+        shared = together(*(part @ J.T for part in each))
+        odds, own = together(*(part.sum(1) for part in alone)), together(*(part @ (1 - J).T for part in alone))
         count = J @ J.T
         seen = count >= LEAST_SEEN * np.maximum.outer(np.diag(count), np.diag(count))
         likely = odds > LEAST_ODDS
@@ -713,8 +737,9 @@ class PairEvidence:
         a, b = first.codes[0], other.codes[0]
         both = (a == JUDGED) & (b == JUDGED)
         ratio = np.where(both, first.contrast[0] - other.contrast[0], 0)
-        gone = np.log(ABSENT_SHARE) * (((a == ABSENT) & (b == JUDGED)) * 1.0 - ((b == ABSENT) & (a == JUDGED)))
-        return float(((ratio + gone) / self.area).sum())
+        gone = [np.log(ABSENT_SHARE) * ((x == ABSENT) & (y == JUDGED)) for x, y in ((a, b), (b, a))]
+        here, there = together(np.zeros(2), np.array([(each / self.area).sum() for each in gone]))
+        return float((ratio / self.area).sum() + here - there)
 
 
 @dataclass

@@ -97,7 +97,8 @@ EVEN_ODDS = 5.0  # nats within which residuals themselves choose
 MOST_BEHIND = 60.0  # nats behind the best from which a place is no rival
 
 # Uncertainty of a pair.
-BOUNDED_SLIP_DEG = 4.0  # up to which several pairs together connect frames: an uncertainty like any other
+LEAST_SLIP_DEG = 4.0  # up to which the places along a slip are one
+LEAST_SIDE_DEG = 12.0  # between two sides of an object, or teeth of a gear; closer places are slides along a surface
 LEAST_INFORMATION = 1e-3  # on each unknown, inverse squares of radians and radii
 ERROR_FACTOR = (
     2.0  # on the sigma by the likelihood's curvature: the decoder's errors are shared over more than a window
@@ -158,8 +159,8 @@ class PairMatch:
 
     @property
     def holds(self) -> bool:
-        """Whether the pair holds its frames in place, to within a slip that other pairs end."""
-        return self.slip_deg <= BOUNDED_SLIP_DEG
+        """Whether the pair tells which side of the object its frames see: a slide along one is ended by other pairs."""
+        return self.slip_deg < LEAST_SIDE_DEG
 
     @property
     def by_tone(self) -> bool:
@@ -182,9 +183,21 @@ class PairMatch:
         near = np.einsum("mij,ij->m", R, S.R) >= 1 + 2 * math.cos(math.radians(SAME_TURN_DEG))
         return float(odds[near].max()) if near.any() else None
 
+    @cached_property
+    def sides(self) -> tuple[Rival, ...]:
+        """Its places, without those to which a likelier one slides: the covariance covers them."""
+        if self.slip_deg == 0:
+            return self.places
+        kept: list[Rival] = []
+        for one in sorted(self.places, key=lambda place: -place.log_odds):
+            R = one.S_target_source.R
+            if all(angle_deg(R @ other.S_target_source.R.T) > self.slip_deg for other in kept):
+                kept.append(one)
+        return tuple(kept)
+
     def nearest(self, S: Similarity) -> Similarity:
-        """The place with the rotation nearest to that of a similarity."""
-        return self.places[int(np.argmax(np.einsum("mij,ij->m", self._rotations[0], S.R)))].S_target_source
+        """The side with the rotation nearest to that of a similarity."""
+        return max((one.S_target_source for one in self.sides), key=lambda side: float((side.R * S.R).sum()))
 
     def knows(self, nodes: Mapping[int, Similarity]) -> bool:
         """Whether both frames are among these nodes, at one of its places to each other."""
@@ -218,8 +231,8 @@ def support_of(overlap: float, fitness: float) -> float:
 
 def edge_weights(edges: Sequence[PairMatch]) -> Float64[ndarray, "edges"]:
     """Weight of each pair in a pose graph: about the probability that it is right, by its rivals."""
-    odds = [sum(math.exp(min(rival.log_odds, 0.0)) for rival in e.rivals) for e in edges]
-    return np.maximum(1 / (1 + np.array(odds, dtype=np.float64)), LEAST_WEIGHT)
+    odds = [sum(math.exp(min(side.log_odds, 0.0)) for side in e.sides) for e in edges]
+    return np.maximum(1 / np.array(odds, dtype=np.float64), LEAST_WEIGHT)
 
 
 # Search: similarities from which two surfaces come to agree, wherever that is.
@@ -370,14 +383,30 @@ def best_match(evidence: PairEvidence, starts: Places, pair: tuple[int, int]) ->
     covariance = np.linalg.inv(similarity_information(H[best]) + LEAST_INFORMATION * np.eye(7))
     covariance *= (ERROR_FACTOR * max(noise)) ** 2
     covariance += np.diag(np.r_[np.full(3, LEAST_SIGMA_SHIFT), np.full(4, np.radians(LEAST_SIGMA_DEG))] ** 2)
-    slips = slip > BOUNDED_SLIP_DEG
-    covariance += np.radians(slip / 2 if not slips else slip) ** 2 * np.outer(direction, direction)
+    rivals = [Rival(places.similarity(k), float(odds[k] - odds[best])) for k in different[:MOST_RIVALS]]
+    along = variance_along((Rival(places.similarity(best), 0.0), *rivals), slip)
+    covariance += along * np.outer(direction, direction)
     return PairMatch(
         *pair, places.similarity(best), np.linalg.inv(covariance), agreeing, agreeing / max(expected, 1e-9),
-        alone, tuple(Rival(places.similarity(k), float(odds[k] - odds[best])) for k in different[:MOST_RIVALS]),
-        float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))), slip if slips else 0.0,
-        direction, common, noise,
+        alone, tuple(rivals), float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))),
+        slip if slip > LEAST_SLIP_DEG else 0.0, direction, common, noise,
     )  # fmt: skip
+
+
+def variance_along(places: Sequence[Rival], slip_deg: float) -> float:
+    """Variance of a rotation along a slip, square radians: of the places along it, which are about equally far apart.
+
+    Of any rotation between minus and plus the slip, where it leads from one side of an object to others.
+    """
+    if slip_deg <= LEAST_SLIP_DEG:
+        return math.radians(slip_deg / 2) ** 2  # too near to each other to be places
+    if slip_deg >= LEAST_SIDE_DEG:
+        return math.radians(slip_deg) ** 2 / 3
+    turned = np.array([angle_deg(one.S_target_source.R @ places[0].S_target_source.R.T) for one in places])
+    inside = turned <= slip_deg
+    odds = np.array([one.log_odds for one in places])[inside]
+    probability = np.exp(odds - odds.max())
+    return float(probability @ np.radians(turned[inside]) ** 2 / probability.sum())
 
 
 def _slip_deg(turned: Float64[ndarray, "k"]) -> float:
@@ -560,7 +589,7 @@ def held_by_tone(
 
     Other places of the pair are passed over: tones were compared all the way around.
     """
-    if match.holds:
+    if match.slip_deg == 0:
         return match
     sides = Side.sampled(maps[0], TONE_FOLLOWED_POINTS, rng), Side.sampled(maps[1], TONE_FOLLOWED_POINTS, rng)
     turned = turn_by_tone(sides, match.S_target_source, match.slip_direction, Tolerance(0.0, TONE_SIGMAS))
@@ -573,8 +602,8 @@ def held_by_tone(
     odds = evidence.log_odds(found, match.common)
     if odds[1] < odds[0] - TONE_LARGEST_LOSS:
         return match
-    d, slip = match.slip_direction, np.radians(match.slip_deg)
-    covariance = np.linalg.inv(match.information) + (np.radians(sigma_deg) ** 2 - slip**2) * np.outer(d, d)
+    d, along = match.slip_direction, variance_along(match.places, match.slip_deg)
+    covariance = np.linalg.inv(match.information) + (math.radians(sigma_deg) ** 2 - along) * np.outer(d, d)
     return replace(
         match, S_target_source=places.similarity(0), information=np.linalg.inv(covariance), rivals=(), slip_deg=0.0,
         rotation_sigma_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))), by_shape=match,

@@ -32,7 +32,7 @@ from sl_nerfstudio.registration.pairs import (
     register_pair,
     search_score,
 )
-from sl_nerfstudio.registration.pose_graph import Component, PoseGraphSolution
+from sl_nerfstudio.registration.pose_graph import Component, EdgeArrays, Pivots, PoseGraphSolution
 from sl_nerfstudio.registration.result import (
     Edge,
     Exclusion,
@@ -92,7 +92,7 @@ def register(
         for gap in SEQUENCE_GAPS:
             graph.try_pairs([(k, k + gap) for k in range(n - gap)], NEIGHBOURS)
         graph.learn_step()
-        ordered = _in_order(graph.assemble(), n)
+        ordered = graph.step is not None or _in_order(graph.assemble(), n)
     if start is None and not ordered:
         report("comparing all frames")
         graph = ViewGraph(frames, centred, np.random.default_rng(seed))  # what chance neighbours say is no help
@@ -132,7 +132,7 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
     poses, baseline = _in_first_camera(solution.S_world_camera, registered)
     index: list[int] = np.flatnonzero(registered).tolist()
     consistent = [e for e, used in zip(edges, solution.consistent, strict=True) if used]
-    sigma = {k: _least_sigma_deg([e for e in consistent if k in (e.source, e.target)]) for k in index}
+    sigma = {k: _rotation_sigma_deg(k, consistent, graph.pivots) for k in index}
     return Registration(
         names,
         poses,
@@ -229,15 +229,20 @@ def _exclusion(
         return OpenPlace(names[k], group, block.turn_deg, block.log_odds, partner)
     # where no two frames could be joined, every pair of the frame might have joined it
     joining = [e for e in ([e for e, _ in across] if main else mine) if is_accepted(e)]
-    slips = bool(joining) and all(e.slip_deg > 0 for e in joining)
+    slips = bool(joining) and not any(e.holds for e in joining)
     return SeparateComponent(names[k], tuple(names[j] for j in sorted(component)), slips, partner)
 
 
-def _least_sigma_deg(pairs: Sequence[PairMatch]) -> float:
-    """Standard deviation of a frame's least known rotation by its best pair; 0 without pairs."""
-    if pairs and all(e.slip_deg > 0 for e in pairs):
-        return UNKNOWN_SIGMA_ROTATION_DEG
-    return min((e.rotation_sigma_deg for e in pairs), default=0.0)
+def _rotation_sigma_deg(frame: int, pairs: Sequence[PairMatch], pivots: Pivots) -> float:
+    """Standard deviation of a frame's least known rotation by all of its pairs, the other frames held."""
+    mine = [e for e in pairs if frame in (e.source, e.target)]
+    if not mine:
+        return 0.0
+    arrays = EdgeArrays.of(mine)
+    A = np.where((arrays.source == frame)[:, None, None], arrays.adjoints(pivots), np.eye(7))
+    covariance = np.linalg.inv((A.transpose(0, 2, 1) @ arrays.information @ A).sum(0))
+    sigma = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])))
+    return min(sigma, UNKNOWN_SIGMA_ROTATION_DEG)
 
 
 # Frames that were left out are placed against the others once those are adjusted. Before the joint adjustment every

@@ -111,7 +111,7 @@ class UncertainRotation:
     """A frame may slip along the surface that other frames see, as on a vase without texture."""
 
     frame: str
-    sigma_deg: float  # of the least known rotation, by the best pair
+    sigma_deg: float  # of the least known rotation, by all pairs of the frame
 
 
 @dataclass(frozen=True)

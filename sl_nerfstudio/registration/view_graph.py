@@ -56,6 +56,7 @@ LARGEST_STEP_DEG = 40.0  # of someone who walks around an object
 NO_ORDER_DEG = 25.0  # spread of the turns of frames in no order that see a common surface
 SMALL_STEP_DEG = 10.0  # of steps that surfaces allow alike smaller ones are likelier: scale of their distribution
 ORDER_ODDS = 5.0  # nats by which an order must be likelier than none: sets in order have 12 to 45, others -6 to 0
+SHARED_ERRORS = 3.0  # by which nats of places are divided there: errors that pixels share let wrong ones lead by a few
 LEAST_LIKELIHOOD = 1e-300  # so that what nothing explains has a logarithm
 STEP_STARTS, STEP_ROUNDS = 80, 12  # of the search for the usual step
 LARGEST_GAP = 2  # between frames by which the usual step is learnt
@@ -399,7 +400,7 @@ class Turns:
         """Stack the places of pairs."""
         turn, weight, number = list[Float64[ndarray, "3"]](), list[Float64[ndarray, "m"]](), list[int]()
         for k, e in enumerate(pairs):
-            odds = np.array([one.log_odds for one in e.places])
+            odds = np.array([one.log_odds for one in e.places]) / SHARED_ERRORS
             weight.append(np.exp(odds - odds.max()) / np.exp(odds - odds.max()).sum())
             number += [k] * len(odds)
             for one in e.places:

@@ -10,7 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.registration.assembly import Assembly
-from sl_nerfstudio.registration.evidence import Commonness, FrameEvidence, KeptResiduals, ScanEvidence, frame_evidence
+from sl_nerfstudio.registration.evidence import (
+    Commonness,
+    Comparison,
+    FrameEvidence,
+    KeptResiduals,
+    ScanEvidence,
+    frame_evidence,
+)
 from sl_nerfstudio.registration.pairs import LEAST_ODDS, PairMatch, Rival
 from sl_nerfstudio.registration.pose_graph import Pivots
 from sl_nerfstudio.registration.surfaces import frame_cloud
@@ -192,3 +199,23 @@ def test_an_object_looks_alike_after_a_turn_if_its_frames_say_so_and_not_for_wha
     for known, alike in ((half, odd == 0), (Similarity(1.0, rolled(90), np.zeros(3)), False)):
         assembly = assembly_of(frames, [edge([same, same], 0, 1, rivals=(Rival(known, 0.0),))])
         assert assembly.looks_alike({0: same, 1: same}, half) is alike
+
+
+class OneFrameIsWrong(ScanEvidence):
+    """Every pair says by 15 nats that the first place is right, those of the last frame by 500 that the second is."""
+
+    def comparison(self, source, target, places):
+        lead = -500.0 if FRAMES - 1 in (source, target) else 15.0
+        shared = lead * np.sign(np.arange(len(places)) - np.arange(len(places))[:, None])
+        return replace(Comparison.none(len(places)), shared=shared, odds=np.full(len(places), 50.0))
+
+
+def test_one_frame_whose_own_shape_is_wrong_decides_nothing_against_all_others(frames):
+    """By a wrong pose of its projector: what it contradicts by hundreds of nats is no more than that."""
+    assembly = assembly_of(frames, right(FIRST + SECOND))
+    scan = assembly_of(frames, [])._scan
+    assembly._scan = OneFrameIsWrong(scan._residuals, scan.common, scan.noise)
+    first, second = ({k: TRUE[k] for k in part} for part in (range(4), range(4, FRAMES)))
+    aside = {k: turned(S, 20.0, np.zeros(3)) for k, S in second.items()}
+    found = assembly.compare(first, second, [{**first, **second}, {**first, **aside}])
+    assert found.leads[0, 1] > LEAST_ODDS

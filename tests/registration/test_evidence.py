@@ -16,6 +16,7 @@ from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.registration.agreement import HIDDEN_DEPTH, LEAST_LIT_COSINE
 from sl_nerfstudio.registration.evidence import (
     ABSENT,
+    ABSENT_SHARE,
     BLOCK,
     CONTRADICTING_SIGMAS,
     HIDDEN,
@@ -292,6 +293,27 @@ def test_what_an_edge_hides_contradicts_nothing_and_what_lies_behind_a_surface_d
     own = slice(None, len(source.points))
     judged, before = below.codes[0, own] == JUDGED, codes[own] == JUDGED
     assert judged.sum() > 0.8 * before.sum() and np.median(below.z[0, own][judged]) > 5
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5])
+def test_what_hides_a_part_of_the_view_and_is_dark_itself_counts_once(ground, share):
+    """Half of the view, as behind the dark side of a wall, costs no more than one point that is missed by chance."""
+    (source, target), true = ground
+    empty = np.zeros(target.surface.shape[:2], dtype=bool)
+    empty[:, 80 : 80 + round(share * 200)] = True
+    surface = np.where(empty[..., None], np.float32(np.nan), target.surface)
+    lit_far = replace(target.nothing, reach=np.full_like(target.nothing.reach, np.inf))
+    frames = [replace(target, surface=surface, nothing=replace(lit_far, empty=e)) for e in (empty, 0 * empty > 0)]
+    absent, odds = [], []
+    for frame in frames:
+        evidence = PairEvidence(source, frame)
+        found = evidence.compare(Places.of(true))
+        absent.append(float(((found.codes[0] == ABSENT) / evidence.area).sum()))
+        odds.append(float(evidence.log_odds(found, no_knowledge(source, frame))[0]))
+    usual = no_knowledge(target)[0].absent_share
+    assert absent[1] == 0 < absent[0] and (absent[0] > 10) == (share == 0.5)
+    wanted = max(absent[0] * np.log(ABSENT_SHARE / usual), np.log(ABSENT_SHARE))
+    assert odds[0] - odds[1] == pytest.approx(wanted, rel=1e-4)
 
 
 @settings(max_examples=5)

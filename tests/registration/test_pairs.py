@@ -1,5 +1,6 @@
 """Two frames onto each other: search, rivals, slip, tone, and which pairs are accepted."""
 
+import math
 from dataclasses import replace
 from functools import cache
 
@@ -34,6 +35,7 @@ from sl_nerfstudio.registration.pairs import (
     screw_motion,
     search_places,
     turn_by_tone,
+    variance_along,
     weakest_rotation,
     without_guess,
 )
@@ -220,6 +222,35 @@ def test_a_pair_is_accepted_by_its_odds_and_ambiguous_by_its_rivals(odds, rivals
     assert (found.lead > LEAST_ODDS) is (is_accepted(found) and not any(rival >= -LEAST_ODDS for rival in rivals))
 
 
+def about_x(deg: float) -> Similarity:
+    return Similarity(1.0, Rotation.from_rotvec([math.radians(deg), 0.0, 0.0]).as_matrix(), np.zeros(3))
+
+
+def test_places_along_a_slip_are_one_side_and_those_beyond_it_others():
+    """Sides at 0 and 40 degrees, the second with a slide of its own."""
+    rivals = tuple(Rival(about_x(deg), odds) for deg, odds in ((3, -1.0), (-6, -4.0), (40, -2.0), (44, -3.0)))
+    slips = replace(match(), rivals=rivals, slip_deg=7.0)
+    assert [one.log_odds for one in slips.sides] == [0.0, -2.0]
+    for deg, side in ((5.0, 0.0), (-9.0, 0.0), (19.0, 0.0), (43.0, 40.0)):
+        assert angle_deg(slips.nearest(about_x(deg)).R @ about_x(side).R.T) < 1e-6
+    assert slips.log_odds_at(about_x(-6.0)) == -4.0  # what it says of a place is as before
+    (weight,) = edge_weights([slips])
+    assert weight == pytest.approx(1 / (1 + math.exp(-2)))
+    firm = replace(slips, slip_deg=0.0)
+    assert len(firm.sides) == 5 and edge_weights([firm])[0] < weight
+
+
+@given(st.lists(st.floats(-20, 0), min_size=1, max_size=6))
+def test_the_variance_along_a_slip_is_that_of_its_places(odds):
+    """Of the places within it by their probabilities; uniform where it leads from side to side."""
+    places = [Rival(about_x(3.0 * k), float(value)) for k, value in enumerate([0.0, *odds])]
+    p, turned = np.exp([0.0, *odds][:4]), np.array([0.0, 3.0, 6.0, 9.0])[: len(places)]
+    wanted = np.radians(np.sqrt((p * turned**2).sum() / p.sum()))
+    assert math.sqrt(variance_along(places, 9.5)) == pytest.approx(wanted, abs=1e-9)
+    assert math.sqrt(variance_along(places, 150.0)) == pytest.approx(math.radians(150) / math.sqrt(3))
+    assert math.sqrt(variance_along(places, 2.0)) == pytest.approx(math.radians(1.0))
+
+
 @given(st.lists(st.floats(-100, 0), max_size=40), st.integers(0, 39))
 def test_the_weight_of_a_pair_is_about_the_probability_that_it_is_right(rivals, k):
     """Bayes with equal priors; a rival that becomes more likely takes weight away."""
@@ -277,7 +308,7 @@ def matched(scene: str, i: int, j: int):
 
 def test_slipping_about_the_axis_of_a_vase_is_found_and_its_size_is_stated():
     found, true, _, some = matched("vase", 4, 5)
-    assert found.rotation_sigma_deg >= found.slip_deg > 0 and not found.holds
+    assert found.rotation_sigma_deg >= found.slip_deg / np.sqrt(3) > 0 and not found.holds
     # The least known rotation is that about the vase's axis, in the target's camera axes.
     w, vectors = np.linalg.eigh(np.linalg.inv(found.information)[3:6, 3:6])
     axis = some.T_world_camera[1][:3, :3].T @ [0, 0, 1]

@@ -24,7 +24,6 @@ from sl_nerfstudio.registration.result import (
     Registration,
     SeparateComponent,
     SurfaceDisagrees,
-    UncertainRotation,
 )
 from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.candidates import plane_starts
@@ -198,7 +197,7 @@ def test_where_nothing_is_joined_because_everything_slips_every_frame_says_so():
     """Two frames of a vase: to capture more of the same would not help."""
     found = register(rendered("vase", (4, 5)).clouds)
     excluded = {e.frame for e in found.exclusions if isinstance(e, SeparateComponent) and e.slips}
-    assert excluded | {u.frame for u in found.uncertainties if u.sigma_deg > 90} == set(found.names)
+    assert excluded | {u.frame for u in found.uncertainties if u.sigma_deg > 60} == set(found.names)
 
 
 def test_the_rotation_of_a_ball_is_uncertain(clouds):
@@ -231,10 +230,10 @@ def test_uncertainties_follow_their_limits(few, monkeypatch):
     monkeypatch.setattr(module, "is_ambiguous", lambda _: True)
     found = register(few[:3])
     assert all(edge.undecided for edge in found.edges)
-    assert found.uncertainties == tuple(
-        UncertainRotation(name, min(e.rotation_sigma_deg for e in found.edges if name in e.frames))
-        for name in found.names
-    )
+    assert [u.frame for u in found.uncertainties] == list(found.names)
+    for said in found.uncertainties:  # several pairs know more than the best of them, and less than as many like it
+        alone = [e.rotation_sigma_deg for e in found.edges if said.frame in e.frames]
+        assert min(alone) / np.sqrt(len(alone)) < said.sigma_deg < min(alone)
 
 
 def test_what_is_being_done_is_reported(few):
