@@ -339,11 +339,9 @@ class Tracker:
         return ScanEvidence(KeptResiduals(frames), [*common, own], np.array(noise))
 
     def _judged(self, sight: Sight, S: Similarity, edges: Sequence[PairMatch], pivots: Pivots) -> Placed:
-        """The covariance of a frame's place by its pairs, and what it adds."""
+        """The covariance of the last frame's place by its pairs, and what it adds."""
         assert sight.frame is not None
-        arrays = EdgeArrays.of(edges)
-        A = arrays.adjoints(pivots)
-        covariance = np.linalg.inv((A.transpose(0, 2, 1) @ arrays.information @ A).sum(0))
+        covariance = EdgeArrays.of(edges).covariance_of(len(pivots) - 1, pivots)
         c, radius = sight.frame.map.centroid, sight.frame.map.radius
         J = np.concatenate([radius * np.eye(3), np.cross(np.eye(3), -c).T, -c[:, None]], 1)  # of the camera's centre
         seen = np.array([other.R[:, 2] for other in self.model.nodes.values()]) @ S.R[:, 2]

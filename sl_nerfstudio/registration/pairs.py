@@ -16,6 +16,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from scipy.special import softmax
 
 from sl_nerfstudio.geometry.devices import pixel_of
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
@@ -388,9 +389,14 @@ def best_match(evidence: PairEvidence, starts: Places, pair: tuple[int, int]) ->
     covariance += along * np.outer(direction, direction)
     return PairMatch(
         *pair, places.similarity(best), np.linalg.inv(covariance), agreeing, agreeing / max(expected, 1e-9),
-        alone, tuple(rivals), float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))),
+        alone, tuple(rivals), largest_rotation_sigma_deg(covariance),
         slip if slip > LEAST_SLIP_DEG else 0.0, direction, common, noise,
     )  # fmt: skip
+
+
+def largest_rotation_sigma_deg(covariance: Float64[ndarray, "7 7"]) -> float:
+    """Standard deviation of the least known rotation of an increment (v, w, l)."""
+    return float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])))
 
 
 def variance_along(places: Sequence[Rival], slip_deg: float) -> float:
@@ -405,8 +411,7 @@ def variance_along(places: Sequence[Rival], slip_deg: float) -> float:
     turned = np.array([angle_deg(one.S_target_source.R @ places[0].S_target_source.R.T) for one in places])
     inside = turned <= slip_deg
     odds = np.array([one.log_odds for one in places])[inside]
-    probability = np.exp(odds - odds.max())
-    return float(probability @ np.radians(turned[inside]) ** 2 / probability.sum())
+    return float(softmax(odds) @ np.radians(turned[inside]) ** 2)
 
 
 def _slip_deg(turned: Float64[ndarray, "k"]) -> float:
@@ -606,7 +611,7 @@ def held_by_tone(
     covariance = np.linalg.inv(match.information) + (math.radians(sigma_deg) ** 2 - along) * np.outer(d, d)
     return replace(
         match, S_target_source=places.similarity(0), information=np.linalg.inv(covariance), rivals=(), slip_deg=0.0,
-        rotation_sigma_deg=float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1]))), by_shape=match,
+        rotation_sigma_deg=largest_rotation_sigma_deg(covariance), by_shape=match,
     )  # fmt: skip
 
 

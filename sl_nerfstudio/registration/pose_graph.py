@@ -83,6 +83,11 @@ class EdgeArrays:
         A[:, 6, 6] = 1.0
         return A
 
+    def covariance_of(self, frame: int, pivots: Pivots) -> Float64[ndarray, "7 7"]:
+        """The covariance of one frame's increment in its own axes, at one end of all edges, the other ends held."""
+        A = np.where((self.source == frame)[:, None, None], self.adjoints(pivots), np.eye(7))
+        return np.linalg.inv((A.transpose(0, 2, 1) @ self.information @ A).sum(0))
+
 
 def at_places(edges: Sequence[PairMatch], nodes: Mapping[int, Similarity]) -> list[PairMatch]:
     """The pairs, each at that of its places which is nearest to where its frames are."""

@@ -29,6 +29,7 @@ from sl_nerfstudio.registration.pairs import (
     Search,
     is_accepted,
     is_ambiguous,
+    largest_rotation_sigma_deg,
     register_pair,
     search_score,
 )
@@ -238,11 +239,8 @@ def _rotation_sigma_deg(frame: int, pairs: Sequence[PairMatch], pivots: Pivots) 
     mine = [e for e in pairs if frame in (e.source, e.target)]
     if not mine:
         return 0.0
-    arrays = EdgeArrays.of(mine)
-    A = np.where((arrays.source == frame)[:, None, None], arrays.adjoints(pivots), np.eye(7))
-    covariance = np.linalg.inv((A.transpose(0, 2, 1) @ arrays.information @ A).sum(0))
-    sigma = float(np.degrees(np.sqrt(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1])))
-    return min(sigma, UNKNOWN_SIGMA_ROTATION_DEG)
+    covariance = EdgeArrays.of(mine).covariance_of(frame, pivots)
+    return min(largest_rotation_sigma_deg(covariance), UNKNOWN_SIGMA_ROTATION_DEG)
 
 
 # Frames that were left out are placed against the others once those are adjusted. Before the joint adjustment every

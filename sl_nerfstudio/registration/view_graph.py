@@ -11,6 +11,7 @@ from numpy import ndarray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
+from scipy.special import softmax
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.parallel import tracked
@@ -400,9 +401,8 @@ class Turns:
         """Stack the places of pairs."""
         turn, weight, number = list[Float64[ndarray, "3"]](), list[Float64[ndarray, "m"]](), list[int]()
         for k, e in enumerate(pairs):
-            odds = np.array([one.log_odds for one in e.places]) / SHARED_ERRORS
-            weight.append(np.exp(odds - odds.max()) / np.exp(odds - odds.max()).sum())
-            number += [k] * len(odds)
+            weight.append(softmax(np.array([one.log_odds for one in e.places]) / SHARED_ERRORS))
+            number += [k] * len(e.places)
             for one in e.places:
                 S = one.S_target_source.inverse() if e.target > e.source else one.S_target_source
                 turn.append(turn_deg(S) / abs(e.target - e.source))

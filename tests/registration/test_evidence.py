@@ -303,7 +303,9 @@ def test_what_hides_a_part_of_the_view_and_is_dark_itself_counts_once(ground, sh
     empty[:, 80 : 80 + round(share * 200)] = True
     surface = np.where(empty[..., None], np.float32(np.nan), target.surface)
     lit_far = replace(target.nothing, reach=np.full_like(target.nothing.reach, np.inf))
-    frames = [replace(target, surface=surface, nothing=replace(lit_far, empty=e)) for e in (empty, 0 * empty > 0)]
+    frames = [
+        replace(target, surface=surface, nothing=replace(lit_far, empty=e)) for e in (empty, np.zeros_like(empty))
+    ]
     absent, odds = [], []
     for frame in frames:
         evidence = PairEvidence(source, frame)
