@@ -32,9 +32,9 @@ def pytest_configure(config: pytest.Config) -> None:
     """What takes long to import; not in the process that only hands out the tests to others."""
     if config.getoption("numprocesses", None) and not hasattr(config, "workerinput"):
         return
-    import torch
+    from sl_nerfstudio.parallel import only_one_library_thread
 
-    torch.set_num_threads(1)
+    only_one_library_thread()  # numpy was imported by a plugin, before OMP_NUM_THREADS was set
     # While it is imported, nerfstudio looks through the whole call stack 26 times. Under pytest's deep stack that takes
     # half a minute; a new thread has a short one.
     importing = threading.Thread(target=importlib.import_module, args=("nerfstudio.configs.method_configs",))

@@ -35,6 +35,7 @@ from sl_nerfstudio.storage import (
     remove_partial,
     write_atomic,
 )
+from tests.forks import exit_status, fork
 
 
 @contextmanager
@@ -127,27 +128,22 @@ def test_two_processes_do_not_write_into_the_same_file(tmp_path: Path) -> None:
         write_atomic(tmp_path / "a", b"new")
 
 
+def write_often(path: Path, number: int) -> None:
+    for _ in range(100):
+        try:
+            write_atomic(path, bytes([number]) * 20_000)
+        except UserError as error:
+            if "is in use" not in str(error):
+                raise
+
+
 def test_many_processes_that_write_one_file_never_leave_half_of_it(tmp_path: Path) -> None:
-    children = []
-    for k in range(6):
-        child = os.fork()
-        if child == 0:
-            for _ in range(100):
-                try:
-                    write_atomic(tmp_path / "a", bytes([k]) * 20_000)
-                except UserError as error:
-                    if "is in use" not in str(error):
-                        os._exit(1)
-            os._exit(0)
-        children.append(child)
-    running = set(children)
-    while running:
-        done, status = os.waitpid(-1, os.WNOHANG)
-        running -= {done}
-        assert done == 0 or status == 0
+    processes = [fork(write_often, tmp_path / "a", k) for k in range(6)]
+    while any(process.is_alive() for process in processes):
         if (tmp_path / "a").exists():
             content = (tmp_path / "a").read_bytes()
             assert len(content) == 20_000 and len(set(content)) == 1
+    assert all(exit_status(process) == 0 for process in processes)
     assert files(tmp_path) == {"a"}
 
 

@@ -104,15 +104,18 @@ def contents(path: Path) -> dict[str, bytes]:
     return {str(file.relative_to(path)): file.read_bytes() for file in files if file.is_file()}
 
 
-def call(folder: Path, name: str, *arguments: str, seconds: float = 60.0) -> Done:
+def call(
+    folder: Path, name: str, *arguments: str, seconds: float = 60.0, first: Callable[[], None] = lambda: None
+) -> Done:
     """Run a console command in `folder`, in a fork of this process: it need not import everything again.
 
+    The fork calls `first` before the command.
     A command that has not ended after `seconds` is killed, with all processes that it started.
     """
     begin = time.monotonic()
     child = os.fork()
     if child == 0:
-        _run_here(folder, name, arguments)
+        _run_here(folder, name, arguments, first)
     status, usage = _wait(child, begin + seconds)
     out, err = (p.read_text(errors="replace") if p.exists() else "" for p in (folder / _OUT, folder / _ERR))
     return Done(status, out, err, time.monotonic() - begin, usage)
@@ -148,7 +151,7 @@ def _entry_point(name: str) -> tuple[str, str]:
     return module, function
 
 
-def _run_here(folder: Path, name: str, arguments: tuple[str, ...]) -> NoReturn:
+def _run_here(folder: Path, name: str, arguments: tuple[str, ...], first: Callable[[], None]) -> NoReturn:
     """The rest of a forked process: the command, with its output in files."""
     status = 70
     try:
@@ -163,7 +166,9 @@ def _run_here(folder: Path, name: str, arguments: tuple[str, ...]) -> NoReturn:
         sys.stdin, sys.stdout, sys.stderr = os.fdopen(0), os.fdopen(1, "w"), os.fdopen(2, "w")
         sys.argv = [name, *arguments]
         module, function = _entry_point(name)
-        status = _status_of(getattr(importlib.import_module(module), function))
+        main = getattr(importlib.import_module(module), function)
+        first()
+        status = _status_of(main)
         sys.stdout.flush()
         sys.stderr.flush()
     finally:

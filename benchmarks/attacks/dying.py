@@ -2,33 +2,28 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 
 _CHANGES = ("write", "replace", "unlink", "mkdir", "rmdir", "ftruncate")
 
 
-@contextmanager
-def dying(moment: int, number: int = signal.SIGKILL) -> Iterator[None]:
-    """Processes forked in the block send themselves a signal just before their change number `moment`, from 0."""
-    parent, left = os.getpid(), [moment]
+def die_at_change(moment: int, number: int = signal.SIGKILL) -> None:
+    """From now on, this process sends itself a signal just before its change number `moment` of the disk, from 0.
+
+    Folders of machine code do not count: which ones are made depends on what was imported before.
+    """
+    left = moment
 
     def watched(change: Callable[..., Any]) -> Callable[..., Any]:
         def call(*arguments: Any, **named: Any) -> Any:
-            if os.getpid() != parent:
-                left[0] -= 1
-                if left[0] == -1:
-                    os.kill(os.getpid(), number)
+            nonlocal left
+            left -= "__pycache__" not in str(arguments[0])
+            if left == -1:
+                os.kill(os.getpid(), number)
             return change(*arguments, **named)
 
         return call
 
-    before = {name: getattr(os, name) for name in _CHANGES}
-    for name, change in before.items():
-        setattr(os, name, watched(change))
-    try:
-        yield
-    finally:
-        for name, change in before.items():
-            setattr(os, name, change)
+    for name in _CHANGES:
+        setattr(os, name, watched(getattr(os, name)))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import sl_nerfstudio
 from benchmarks.attacks.commands import Case, accepted, call, contents, left_behind, listing, refused, start
-from benchmarks.attacks.dying import dying
+from benchmarks.attacks.dying import die_at_change
 from benchmarks.attacks.flags import CAPTURES, EVAL, EXPORT, FIXTURES, GRAY, PATTERN, PROCESS, SYNTH
 from sl_nerfstudio.storage import locked, locked_file
 
@@ -60,8 +60,7 @@ def cases() -> list[Case]:
 
 def _killed(folder: Path, command: tuple[str, ...], outputs: tuple[str, ...], moment: int) -> str:
     before = listing(folder)
-    with dying(moment):
-        first = call(folder, *command)
+    first = call(folder, *command, first=partial(die_at_change, moment))
     if first.status not in (0, -signal.SIGKILL):
         return f"the killed command ended with status {first.status}"
     again = call(folder, *command)
@@ -87,8 +86,7 @@ def _differs(folder: Path, command: tuple[str, ...], outputs: tuple[str, ...]) -
 
 def _stopped(folder: Path, command: tuple[str, ...], moment: int, number: signal.Signals) -> str:
     before = listing(folder)
-    with dying(moment, number):
-        done = call(folder, *command)
+    done = call(folder, *command, first=partial(die_at_change, moment, number))
     if done.status == 0:
         return accepted(done)
     if (done.status, done.stderr) != _STATUS[number]:
@@ -159,8 +157,7 @@ def _killed_process(folder: Path, stage: str, moment: int) -> str:
         for path in (folder / "work" / "stages").iterdir():
             if not path.name.startswith("calibration"):
                 path.unlink()
-    with dying(moment):
-        done = call(folder, *_PROCESS, seconds=_SECONDS)
+    done = call(folder, *_PROCESS, seconds=_SECONDS, first=partial(die_at_change, moment))
     if done.status == 0:
         return "" if contents(folder / "new") == scan else "another scan"
     if done.status != -signal.SIGKILL:

@@ -1,22 +1,20 @@
 """Images of cameras and of videos in their place."""
 
 import json
-import os
 import shutil
-import signal
 import time
 
 import cv2
 import numpy as np
 import pytest
 
-from benchmarks.attacks.dying import dying
 from sl_nerfstudio.capture import camera as module
 from sl_nerfstudio.capture.camera import Camera, CaptureFolder, Video, open_camera
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.scan.images import read_image
 from tests.capture.fake_camera import FakeCapture
+from tests.forks import killed_at_change
 
 RED = np.zeros((48, 64, 3), dtype=np.uint8) + np.array([200, 10, 10], dtype=np.uint8)
 
@@ -163,18 +161,15 @@ def test_a_sequence_appears_complete_or_not_at_all(tmp_path, monkeypatch):
     assert np.array_equal(read_image(tmp_path / "frame_0000" / "01.png"), 255 - IMAGE)
 
 
+def capture_twice(path):
+    with folder(path) as captures:
+        captures.add(IMAGE)
+        captures.add_sequence([IMAGE, 255 - IMAGE])
+
+
 def test_what_a_killed_command_leaves_is_complete_and_is_continued(tmp_path):
     for moment in range(40):
-        with dying(moment):
-            child = os.fork()
-            if child == 0:
-                try:
-                    with folder(tmp_path) as captures:
-                        captures.add(IMAGE)
-                        captures.add_sequence([IMAGE, 255 - IMAGE])
-                finally:
-                    os._exit(0)
-        was_killed = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+        was_killed = killed_at_change(moment, capture_twice, tmp_path)
         with folder(tmp_path) as captures:
             for path in captures.frames:
                 files = [path] if path.suffix else sorted(path.iterdir())

@@ -1,15 +1,14 @@
 """What a killed command leaves does not stand in the way of the next one, and two at once are refused."""
 
 import os
-import signal
 
 import pytest
 
-from benchmarks.attacks.dying import dying
 from sl_nerfstudio.cli import pattern, process, synth
 from sl_nerfstudio.cli.export import ExportConfig, export
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.storage import NewFolder, locked, locked_file
+from tests.forks import killed_at_change
 
 from .snapshots import call
 
@@ -29,18 +28,6 @@ def run(command, output):
     return call(main, command.split()[0], "--output", output, *flags)
 
 
-def killed(command, output, moment):
-    """Run in a copy of this process, killed at a change of the disk; whether it was."""
-    with dying(moment):
-        child = os.fork()
-        if child == 0:
-            try:
-                run(command, output)
-            finally:
-                os._exit(0)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
-
-
 def content(root):
     return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
@@ -49,14 +36,14 @@ def content(root):
 def test_after_a_kill_at_any_moment_the_same_command_succeeds(tmp_path, command):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     run(command, whole)
-    assert all(killed(command, broken, moment) for moment in (0, 1, 3, 5, 8))
+    assert all(killed_at_change(moment, run, command, broken) for moment in (0, 1, 3, 5, 8))
     assert f"{broken}: removed what " in run(command, broken).err
     assert content(broken) == content(whole)
 
 
 @each_command
 def test_with_a_file_of_the_user_in_it_or_in_use_an_output_is_refused_and_stays(tmp_path, command):
-    assert killed(command, tmp_path / "new", 7)
+    assert killed_at_change(7, run, command, tmp_path / "new")
     (tmp_path / "new" / "mine").write_text("mine")
     before = content(tmp_path)
     ended = run(command, tmp_path / "new")

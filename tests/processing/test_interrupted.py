@@ -2,13 +2,11 @@
 
 import os
 import shutil
-import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from benchmarks.attacks.dying import dying
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.report.capture_reports import render_processing_report
 from sl_nerfstudio.processing import frames
@@ -19,6 +17,7 @@ from sl_nerfstudio.processing.process import process
 from sl_nerfstudio.processing.records import digest
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.storage import LOCK, NewFolder, locked
+from tests.forks import killed_at_change
 from tests.processing.conftest import register_ramps
 from tests.processing.ramp_scan import NAMES, write_poses
 
@@ -41,9 +40,7 @@ def content(root):
 def whole(ramp_scan, tmp_path_factory):
     """The scan of a run that nothing interrupted, and its work folder."""
     root = tmp_path_factory.mktemp("whole")
-    with pytest.MonkeyPatch.context() as patch:
-        register_ramps(patch)
-        run(ramp_scan.config(root / "s", known_length="baseline of frame 1 = 5 cm"))
+    run_ramps(ramp_scan.config(root / "s", known_length="baseline of frame 1 = 5 cm"))
     return root
 
 
@@ -52,16 +49,11 @@ def config(ramp_scan, tmp_path):
     return ramp_scan.config(tmp_path / "s", known_length="baseline of frame 1 = 5 cm")
 
 
-def killed(config, moment):
-    """A run in a copy of this process, killed at its change of the disk number `moment`; whether it was."""
-    with dying(moment):
-        child = os.fork()
-        if child == 0:
-            try:
-                process(config, render_processing_report, lambda _: None)
-            finally:
-                os._exit(0)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+def run_ramps(config):
+    """A run in a process that does not know the toy decoder."""
+    with pytest.MonkeyPatch.context() as patch:
+        register_ramps(patch)
+        run(config)
 
 
 @pytest.fixture
@@ -73,7 +65,7 @@ def resumed(whole, config):
 
 def test_killed_at_any_moment_the_next_run_ends_with_the_same_bytes(whole, config):
     """Moments from the beginning to the end, one after the other in the same folders."""
-    assert sum(killed(config, moment) for moment in (0, 9, 28, 42, 50, 60, 71, 95)) >= 6
+    assert sum(killed_at_change(moment, run_ramps, config) for moment in (0, 9, 28, 42, 50, 60, 71, 95)) >= 6
     log = run(config)
     assert content(config.output) == content(whole / "s")
     assert [line for line in log if line in KEPT] == KEPT and "4 had been decoded before" in "".join(log)
@@ -163,7 +155,7 @@ def test_another_length_renews_the_scan_and_another_output_uses_what_is_kept(who
 
 def test_killed_while_a_scan_is_renewed_the_next_run_succeeds(whole, resumed):
     run(replace(resumed, known_length="baseline of frame 1 = 10 cm"))
-    assert sum(killed(resumed, moment) for moment in (1, 8, 20, 31, 45)) >= 3
+    assert sum(killed_at_change(moment, run_ramps, resumed) for moment in (1, 8, 20, 31, 45)) >= 3
     run(resumed)
     assert content(resumed.output) == content(whole / "s")
 

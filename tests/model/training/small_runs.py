@@ -4,7 +4,6 @@ import copy
 import functools
 import os
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -123,22 +122,3 @@ def status(action: Callable[..., Any], *arguments: Any) -> object:
     with pytest.raises(SystemExit) as end:
         action(*arguments)
     return end.value.code
-
-
-def child(action: Callable[[], Any]) -> int:
-    """Process id of a fork in which the action runs; the fork ends with it."""
-    pid = os.fork()
-    if pid:
-        return pid
-    try:
-        null = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(null, 1)
-        os.dup2(null, 2)
-        action()
-        os._exit(0)
-    except SystemExit as end:
-        os._exit(end.code if isinstance(end.code, int) else 1)
-    except BaseException:
-        os._exit(70)
-    finally:
-        sys.exit(71)

@@ -1,6 +1,7 @@
 """Trainings that are stopped by a signal, or killed, at any moment."""
 
 import copy
+import itertools
 import os
 import random
 import signal
@@ -8,6 +9,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,8 +23,8 @@ from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.run_files import Interrupted, Interruption, checkpoints_in
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from sl_nerfstudio.runs.run import load_run
+from tests.forks import exit_status, fork
 from tests.model.training.small_runs import (
-    child,
     folder_of,
     go_on,
     last_state,
@@ -143,18 +146,19 @@ def test_control_c_in_the_viewer_of_a_finished_training_is_its_normal_end(scan_r
     assert last_state(folder_of(tmp_path))["step"] == 0
 
 
+def signalled_twice(first: signal.Signals, second: signal.Signals) -> None:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    interruption = Interruption()
+    interruption.install()
+    interruption.hold()
+    send(first)
+    send(second)
+    os._exit(99)  # never reached
+
+
 @pytest.mark.parametrize("first, second", [(signal.SIGINT, signal.SIGINT), (signal.SIGINT, signal.SIGTERM)])
 def test_a_second_signal_ends_the_process_at_once(first, second):
-    def work() -> None:
-        interruption = Interruption()
-        interruption.install()
-        interruption.hold()
-        send(first)
-        send(second)
-        os._exit(99)  # never reached
-
-    _, result = os.waitpid(child(work), 0)
-    assert os.waitstatus_to_exitcode(result) == SIGNALS[second]
+    assert exit_status(fork(signalled_twice, first, second)) == SIGNALS[second]
 
 
 def test_an_ignored_signal_stays_ignored():
@@ -175,16 +179,15 @@ def test_two_trainings_are_equal_whatever_else_the_machine_does(scan_root, tmp_p
     """Bit for bit, with several threads and other processes that take the processor away."""
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    busy: list[int] = []
+    busy: list[ForkServerProcess] = []
     try:
         train(settings(scan_root, tmp_path, "alone", steps=6))
-        busy = [child(lambda: [sum(range(1000)) for _ in iter(int, 1)]) for _ in range(os.cpu_count() or 1)]
+        busy = [fork(sum, itertools.repeat(0)) for _ in range(os.cpu_count() or 1)]
         train(settings(scan_root, tmp_path, "beside others", steps=6))
     finally:
         torch.set_num_threads(before)
-        for pid in busy:
-            os.kill(pid, signal.SIGKILL)
-            os.waitpid(pid, 0)
+        for process in busy:
+            process.kill()
     require_equal(last_state(folder_of(tmp_path, "beside others")), last_state(folder_of(tmp_path, "alone")))
 
 
@@ -193,9 +196,12 @@ def test_a_killed_training_goes_on_or_starts_again(scan_root, finished, tmp_path
     folder, moments = folder_of(tmp_path), random.Random(7)
     config = settings(scan_root, tmp_path, steps_per_save=2)
     for _ in range(6):
-        begin = go_on_or_train(folder, config)
-        if not _killed(child(begin), moments.uniform(0.3, 2.0)):
+        process = fork(go_on_or_train(folder, config))
+        process.join(moments.uniform(0.3, 2.0))
+        if process.exitcode == 0:
             break
+        process.kill()
+        assert exit_status(process) == -signal.SIGKILL
     else:
         go_on_or_train(folder, config)()
     require_equal(torch.load(checkpoints_in(folder / "nerfstudio_models")[-1]), last_state(finished))
@@ -205,20 +211,8 @@ def test_a_killed_training_goes_on_or_starts_again(scan_root, finished, tmp_path
 def go_on_or_train(folder: Path, config: SLTrainerConfig) -> Callable[[], None]:
     """What a person would do next: killed during the checks, nothing is there."""
     if (folder / "config.yml").exists():
-        return lambda: go_on(folder / "config.yml")
-    return lambda: train(copy.deepcopy(config))
-
-
-def _killed(pid: int, seconds: float) -> bool:
-    """Kill a child after some time; whether it had not ended before."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if os.waitpid(pid, os.WNOHANG)[0]:
-            return False
-        time.sleep(0.01)
-    os.kill(pid, signal.SIGKILL)
-    os.waitpid(pid, 0)
-    return True
+        return partial(go_on, folder / "config.yml")
+    return partial(train, copy.deepcopy(config))
 
 
 def test_the_installed_command_itself(scan_root, tmp_path):

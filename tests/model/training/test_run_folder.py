@@ -11,8 +11,8 @@ import pytest
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.methods import sl_neus_paper
 from sl_nerfstudio.model.run_files import LOCK, take_folder
+from tests.forks import exit_status, fork
 from tests.model.training.small_runs import (
-    child,
     content,
     folder_of,
     go_on,
@@ -132,22 +132,22 @@ def test_a_complete_run_is_not_continued(finished, capfd):
     assert f"--load-dir {finished}/nerfstudio_models" in error and "--timestamp first" in error
 
 
+def hold(folder: Path) -> None:
+    take_folder(folder)
+    (folder / "ready").touch()
+    time.sleep(60)
+
+
 def test_two_processes_do_not_write_to_one_folder(tmp_path):
     """The lock ends with its process, however that ends."""
     folder = tmp_path / "run"
-
-    def hold() -> None:
-        take_folder(folder)
-        (folder / "ready").touch()
-        time.sleep(60)
-
-    other = child(hold)
+    other = fork(hold, folder)
     while not (folder / "ready").exists():
         time.sleep(0.01)
-    with pytest.raises(UserError, match=rf"another ns-train is writing there \(process {other}\)"):
+    with pytest.raises(UserError, match=rf"another ns-train is writing there \(process {other.pid}\)"):
         take_folder(folder)
-    os.kill(other, signal.SIGKILL)
-    os.waitpid(other, 0)
+    other.kill()
+    assert exit_status(other) == -signal.SIGKILL
     for _ in range(2):
         os.close(take_folder(folder))
 

@@ -1,9 +1,7 @@
 """Trainings by two processes, which nerfstudio starts for two GPUs; here they work on the CPU."""
 
-import multiprocessing
 import os
 import signal
-import warnings
 from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
@@ -23,43 +21,27 @@ from sl_nerfstudio.model.model import SLModel
 from sl_nerfstudio.model.optimisers import RowAdamOptimizerConfig
 from sl_nerfstudio.model.trainer import SLTrainerConfig
 from tests.field.fields import make_field, points_around
+from tests.forks import LONGEST, exit_status, fork
 from tests.model.training.small_runs import folder_of, last_state, require_equal, settings
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # nerfstudio warns freely
 
 
-FORKS = multiprocessing.get_context("forkserver")  # a fork of this process would have its locks, and nobody frees them
-FORKS.set_forkserver_preload([__name__])
-LONGEST = 300.0  # seconds
-
-
 def joined(work: Callable[..., None], rank: int, meeting: Path, *arguments: Any) -> None:
-    """The work of one of two processes that know each other, in silence."""
-    null = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, 1)
-    os.dup2(null, 2)
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(1)
+    """The work of one of two processes that know each other."""
     dist.init_process_group("gloo", f"file://{meeting}", timedelta(seconds=LONGEST), world_size=2, rank=rank)
     comms.LOCAL_PROCESS_GROUP = dist.new_group([0, 1])  # type: ignore[assignment]
     work(rank, *arguments)
     dist.destroy_process_group()
 
 
-def in_two(work: Callable[..., None], meeting: Path, *arguments: Any) -> list[int | None]:
-    """Do some work in two processes that know each other; their exit statuses, None of one that does not end."""
-    both = [FORKS.Process(target=joined, args=(work, rank, meeting, *arguments)) for rank in range(2)]
-    for process in both:
-        process.start()
-    for process in both:
-        process.join(LONGEST)
-    found = [process.exitcode for process in both]
-    for process in both:
-        process.kill()
-    return found
+def in_two(work: Callable[..., None], meeting: Path, *arguments: Any) -> list[int]:
+    """Do some work in two processes that know each other; their exit statuses."""
+    both = [fork(joined, work, rank, meeting, *arguments) for rank in range(2)]
+    return [exit_status(process) for process in both]
 
 
-def train_by_two(config: SLTrainerConfig, work: Callable[..., None]) -> list[int | None]:
+def train_by_two(config: SLTrainerConfig, work: Callable[..., None]) -> list[int]:
     """As nerfstudio does, once it has several devices."""
     config.pipeline.datamanager.data = config.data
     config.set_timestamp()
