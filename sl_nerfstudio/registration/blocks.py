@@ -119,8 +119,12 @@ class BlockReview:
     def _moves(self, turns: Sequence[Turn]) -> Iterator[Cut]:
         """Blocks that are likelier elsewhere, then single frames."""
         cuts = sorted((best_block(t.by_surface + t.by_order, t) for t in turns), key=lambda cut: -cut.gain)
-        yield from (cut for cut in cuts if cut.gain > LEAST_GAIN and self._verified(cut) > LEAST_GAIN)
-        yield from (cut for cut in self._single_frames(np.ones(len(self.nodes), dtype=bool)) if cut.gain > LEAST_GAIN)
+        yield from filter(self._gains, cuts)
+        yield from filter(self._gains, self._single_frames(np.ones(len(self.nodes), dtype=bool)))
+
+    def _gains(self, cut: Cut) -> bool:
+        """Whether a block is likelier elsewhere; by one measure for all blocks, or they would move to and fro."""
+        return cut.gain > LEAST_GAIN and self._verified(cut) > LEAST_GAIN
 
     def _open(self, turns: Sequence[Turn], with_order: bool) -> list[OpenBlock]:
         """Blocks whose place is not decided, one after the other: of two parts the smaller is taken out.
