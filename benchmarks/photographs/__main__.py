@@ -37,7 +37,7 @@ from sl_nerfstudio.cli.run import run
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.processing.config import ProcessConfig
 from sl_nerfstudio.processing.consistency import adjust_consistent, registered_only
-from sl_nerfstudio.processing.frames import clouds_of
+from sl_nerfstudio.processing.frames import captures_of, clouds_of
 from sl_nerfstudio.processing.inputs import read_inputs
 from sl_nerfstudio.processing.process import register_clouds
 from sl_nerfstudio.processing.projector import calibrate_frames
@@ -129,10 +129,11 @@ def _in_this_process(captures: Path, config: Config) -> tuple[Sequence[FoundFram
         images=captures / "images", pattern=captures / "pattern.json", intrinsics=captures / "intrinsics.json",
         output=captures / "scan", work=captures / WORK, jobs=config.jobs, unordered=note_of(captures)["unordered"],
     )  # fmt: skip
-    clouds = clouds_of(calibrate_frames(job, read_inputs(job), _silent).results)
+    results = calibrate_frames(job, read_inputs(job), _silent).results
+    clouds = clouds_of(results)
     if config.until == "decoded":
         return [], "-"
-    chosen, found = register_clouds(clouds, job.unordered, job.seed, None, _silent)
+    chosen, found = register_clouds(clouds, captures_of(results), job.unordered, job.seed, None, _silent)
     clouds = chosen_clouds(clouds, chosen)
     adjust = config.until == "adjusted"
     kept = adjust_consistent(clouds, found, _silent) if adjust else registered_only(clouds, found)

@@ -113,6 +113,11 @@ def clouds_of(results: Sequence[FrameStageResult]) -> list[FrameCloud]:
     return [result.cloud for result in results if result.cloud is not None]
 
 
+def captures_of(results: Sequence[FrameStageResult]) -> tuple[int, ...]:
+    """Numbers, from 0, of the captures that those clouds are of."""
+    return tuple(k for k, result in enumerate(results) if result.cloud is not None)
+
+
 def matches_of(clouds: Sequence[FrameCloud]) -> tuple[list[FrameMatches], list[tuple[ndarray, ndarray]]]:
     """The correspondences of frames, and R and t of their relative poses: what fits to all frames start from."""
     frames = [FrameMatches(cloud.name, *correspondences_of(cloud.coords), cloud.camera) for cloud in clouds]

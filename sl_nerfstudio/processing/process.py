@@ -41,6 +41,7 @@ from sl_nerfstudio.processing.frames import (
     FrameJob,
     FrameStageResult,
     FrameWorker,
+    captures_of,
     clouds_of,
     run_frame_stage_again,
     with_clouds,
@@ -328,7 +329,8 @@ class _Run:
             require_known_frames(self.inputs.known, clouds)
         if registration is None:
             config, log = self.config, self.log
-            settings = config.unordered, config.seed, None if given is None else given.T_world_camera
+            start = None if given is None else given.T_world_camera
+            settings = captures_of(frames.results), config.unordered, config.seed, start
             chosen, registration = StageStore(frames.job.work, log).kept(
                 "registration", (clouds, *settings), lambda: register_clouds(clouds, *settings, log)
             )
@@ -433,16 +435,24 @@ class _Run:
 
 
 def register_clouds(
-    clouds: Sequence[FrameCloud], unordered: bool, seed: int, start: Float64[ndarray, "n 4 4"] | None, log: Log
+    clouds: Sequence[FrameCloud],
+    captures: Sequence[int],
+    unordered: bool,
+    seed: int,
+    start: Float64[ndarray, "n 4 4"] | None,
+    log: Log,
 ) -> tuple[tuple[int, ...], Registration]:
-    """Which cloud of every frame, and the registration of these; every pair is tried if the order says nothing."""
+    """Which cloud of every frame, and the registration of these; every pair is tried if the order says nothing.
+
+    `captures`: number of each frame's capture.
+    """
     choice = choose_projectors(clouds, not unordered, seed)
-    registration = register(chosen_clouds(clouds, choice.chosen), not unordered, seed, start)
+    registration = register(chosen_clouds(clouds, choice.chosen), not unordered, seed, start, captures)
     if not (unordered or registration.ordered):
         log("the frames do not follow each other in the order of capture: --unordered says so")
         before, choice = choice, choose_projectors(clouds, False, seed)  # they were compared with wrong neighbours
         if choice.chosen != before.chosen:
-            registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start)
+            registration = register(chosen_clouds(clouds, choice.chosen), False, seed, start, captures)
     return choice.chosen, without_undecided(registration, choice.undecided)
 
 

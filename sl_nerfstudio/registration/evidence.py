@@ -22,7 +22,6 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of
 from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.geometry.numerics import quantile
 from sl_nerfstudio.parallel import both, compiled, compiled_range
 from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, HIDDEN_DEPTH, LEAST_LIT_COSINE, Hypotheses, lit
 from sl_nerfstudio.registration.surfaces import (
@@ -56,9 +55,7 @@ NOISE_QUANTILES = np.array([0.68, 0.95])  # of residuals, by which a pair's are 
 LARGEST_NOISE = 5.0  # factor: beyond it residuals are no noise, the place is wrong
 NOISE_RESIDUALS = np.array([1.06, 3.2])  # its quantiles there
 USUAL_SIGMAS = 1.0  # of a residual in the right place
-INDISTINCT_SIGMAS = 2.5  # within which residuals say nothing of the place: views that are alike share errors
-SPREADS = np.array([0.8, 1.2, 1.8, 3.0, 6.0])  # sigma relative to the usual one: points are grouped by it
-LARGEST_SHARED = 2.0  # factor by which residuals may be smaller, or larger, for that
+INDISTINCT_SIGMAS = 3.0  # within which residuals say nothing of the place: views that are alike share errors
 FEWEST_JUDGED = 50  # points by which that is known
 ELSEWHERE_SIGMA = 12.0  # of a point that does not belong there: somewhere near, or anywhere
 
@@ -80,7 +77,7 @@ NEAR_DEG, NEAR_SHIFT = 2.0, 0.08  # how far that may be: degrees, radii
 NEAR_SIGMAS = 3.0  # and what errors of both relative poses explain
 NEARLY_SAME_SHIFT = 0.01  # radii, between two places of which evidence is asked only once
 NEARLY_SAME_TRACE = 1 + 2 * np.cos(np.radians(0.5))  # of the rotation between them
-MOST_KEPT = 3000  # places of which residuals are kept, of 72 kB each
+MOST_KEPT = 6000  # places of which residuals are kept, of 36 kB each
 
 CONTRADICTING_SIGMAS = 3.0  # behind the surface, from which it is asked whether an edge hides a point
 STEEPEST = 5.0  # change of distance from place to place, in their width, beyond which a surface has an edge
@@ -703,22 +700,9 @@ class PairEvidence:
         return found.noise(k, slice(None, n)), found.noise(k, slice(n, None))
 
     def scaled(self, found: Compared, noise: tuple[float, float]) -> Compared:
-        """Residuals in units of what they are found to be, and of those of each place on smooth surface.
-
-        Frames that look the same way share the decoder's systematic errors, so they agree a little better: a place at
-        which they do is not more likely for that.
-        """
+        """Residuals in units of what they are found to be."""
         each = [np.full(len(points), size) for points, size in zip(self._points, noise, strict=True)]
-        found = found.scaled(np.concatenate(each))
-        z, judged = found.z.copy(), found.codes == JUDGED
-        group = np.searchsorted(SPREADS, found.spread)
-        for k in range(len(z)):
-            for g in range(len(SPREADS) + 1):
-                here = judged[k] & (group[k] == g)
-                if here.sum() >= FEWEST_JUDGED:
-                    own = quantile(np.abs(z[k][here]), NOISE_QUANTILES[0]) / NOISE_RESIDUALS[0]
-                    z[k][here] /= np.clip(own, 1 / LARGEST_SHARED, LARGEST_SHARED)
-        return Compared(z, found.codes, found.spread, INDISTINCT_SIGMAS)
+        return replace(found.scaled(np.concatenate(each)), indistinct=INDISTINCT_SIGMAS)
 
     def by_likelihood(self, found: Compared) -> Float64[ndarray, "k"]:
         """By how many nats each place leads the others, at worst; of places that see enough of each other's surface."""
@@ -742,20 +726,12 @@ class PairEvidence:
         return float((ratio / self.area).sum() + here - there)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Kept:
-    """Residuals at a place, and the same in units of the frames' noise as it was last known."""
+    """Residuals at the most likely place close to one that was asked for."""
 
     place: Similarity
     compared: Compared
-    noise: tuple[float, float] = (np.nan, np.nan)
-    scaled: Compared | None = None
-
-    def in_units(self, noise: tuple[float, float], pair: PairEvidence) -> Compared:
-        """In units of the noise of both frames."""
-        if self.scaled is None or self.noise != noise:
-            self.noise, self.scaled = noise, pair.scaled(self.compared, noise)
-        return self.scaled
 
 
 class KeptResiduals:
@@ -769,10 +745,8 @@ class KeptResiduals:
         self._found: dict[tuple[int, int], list[_Kept]] = {}
         self._count = 0
 
-    def near(
-        self, source: int, target: int, places: Sequence[Similarity], noise: tuple[float, float]
-    ) -> list[Compared]:
-        """Residuals at each place, in units of the noise of both frames."""
+    def near(self, source: int, target: int, places: Sequence[Similarity]) -> Compared:
+        """Residuals at each place."""
         a, b = self.frames[source], self.frames[target]
         pair, before = PairEvidence(a, b), self._found.get((source, target), [])
         known = [next((one for one in before if nearly_same(a, one.place, place)), None) for place in places]
@@ -787,7 +761,7 @@ class KeptResiduals:
             self._count += len(new)
             following = iter(rows)
             known = [next(following) if one is None else one for one in known]
-        return [one.in_units(noise, pair) for one in known if one is not None]
+        return Compared.joined([one.compared for one in known if one is not None])
 
     @staticmethod
     def _likeliest_near(a: FrameEvidence, b: FrameEvidence, start: Places) -> Places:
@@ -840,8 +814,8 @@ class ScanEvidence:
         a, b = self.frames[source], self.frames[target]
         if not (places and len(a.points) and len(b.points)):
             return None
-        noise = float(self.noise[source]), float(self.noise[target])
-        return PairEvidence(a, b), Compared.joined(self._residuals.near(source, target, places, noise))
+        pair, noise = PairEvidence(a, b), (float(self.noise[source]), float(self.noise[target]))
+        return pair, pair.scaled(self._residuals.near(source, target, places), noise)
 
 
 def nearly_same(source: FrameEvidence, S: Similarity, place: Similarity) -> bool:

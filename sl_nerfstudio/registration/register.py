@@ -66,6 +66,7 @@ def register(
     sequence: bool = True,
     seed: int = 0,
     start: Float64[ndarray, "n 4 4"] | None = None,
+    captures: Sequence[int] | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Registration:
     """Camera poses of all frames in one world; alternatives of the clouds are not considered.
@@ -75,6 +76,7 @@ def register(
         sequence: each frame overlaps its neighbours; if not, or where few of them do, every pair is tried.
         seed: of the choice of points.
         start: camera poses (camera to world) that are known roughly, within about 20 degrees; NaN where unknown.
+        captures: number of each frame's capture, if some between them are not used; by default 0, 1, 2 and so on.
         progress: called with a few words at the beginning of each stage.
     """
     report = progress or (lambda _: None)
@@ -83,7 +85,7 @@ def register(
     maps = [frame.map for frame in frames]
     rough = {} if start is None else starting_similarities(start, maps)
     centred = with_common_centre(rough, maps)
-    graph = ViewGraph(frames, centred, np.random.default_rng(seed))
+    graph = ViewGraph(frames, centred, np.random.default_rng(seed), captures)
     report("registering pairs")
     if start is not None:
         graph.try_overlapping(rough)
@@ -96,7 +98,8 @@ def register(
         ordered = graph.step is not None or _in_order(graph.assemble(), n)
     if start is None and not ordered:
         report("comparing all frames")
-        graph = ViewGraph(frames, centred, np.random.default_rng(seed))  # what chance neighbours say is no help
+        # what chance neighbours say is no help
+        graph = ViewGraph(frames, centred, np.random.default_rng(seed), captures)
         graph.try_all()
     for _ in range(ROUNDS):
         report("closing loops")
@@ -289,7 +292,7 @@ def include_left_out(
     }
     for k in left_out:
         graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), ANYWHERE)
-    assembly = graph.assembly([e for e in graph.edges if e.holds], graph.evidence())
+    assembly = graph.assembly([e for e in graph.edges if e.holds and not e.slip_deg], graph.evidence())
     placed: Component = {}
     singles: list[Component] = [{k: Similarity.identity()} for k in left_out]
     for block in (*_blocks(registration, left_out), *singles):

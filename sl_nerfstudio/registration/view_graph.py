@@ -150,6 +150,10 @@ class UsualStep:
         """Angle of the usual turn."""
         return float(np.linalg.norm(self.mean_deg))
 
+    def repeated(self, count: int) -> "UsualStep":
+        """Several steps, one after the other."""
+        return UsualStep(count * self.mean_deg, count * self.covariance)
+
     @property
     def rms_deg(self) -> float:
         """Root mean square of the turns' angles."""
@@ -172,8 +176,12 @@ NO_ORDER = UsualStep(np.zeros(3), NO_ORDER_DEG**2 * np.eye(3))
 class ViewGraph:
     """Pairs that were tried, with the best result of each."""
 
-    def __init__(self, frames: list[Frame], start: Component, rng: np.random.Generator) -> None:
+    def __init__(
+        self, frames: list[Frame], start: Component, rng: np.random.Generator, captures: Sequence[int] | None = None
+    ) -> None:
+        """Start without any pair; `start`: nodes that are known roughly. `captures`: see `register`."""
         self.frames = frames
+        self.captures = list(range(len(frames)) if captures is None else captures)
         self.maps = [frame.map for frame in frames]
         self.rng = rng
         self._start = start  # S_world_camera of frames where it is known roughly
@@ -305,10 +313,10 @@ class ViewGraph:
         None if turns do not grow with the number of frames that lie between, as those in no order do not.
         """
         self.step = self._components = None
-        pairs = [e for e in self.edges if abs(e.target - e.source) <= LARGEST_GAP and e.holds]
+        pairs = [e for e in self.edges if abs(self._steps(e.source, e.target)) <= LARGEST_GAP and e.holds]
         if sum(abs(e.target - e.source) == 1 for e in pairs) <= LEAST_STEPS * (len(self.frames) - 1):
             return
-        turns = Turns.of(pairs)
+        turns = Turns.of(pairs, [self._steps(e.source, e.target) for e in pairs])
         (step, odds), (_, without) = likeliest_step(turns), likeliest_step(turns.in_no_order())
         usual = step.rms_deg <= LARGEST_STEP_DEG and turns.probability(step).mean() >= LEAST_STEPS
         if usual and odds >= without + ORDER_ODDS:
@@ -319,7 +327,12 @@ class ViewGraph:
         if self.step is None or abs(i - j) > 1:
             return 0.0
         turn = turn_deg(S_i_j if j > i else S_i_j.inverse())
-        return -min(0.5 * float(self.step.squared_sigmas(turn[None])[0]), MOST_BY_ORDER)
+        usual = self.step.repeated(abs(self._steps(i, j)))  # captures between them may show nothing
+        return -min(0.5 * float(usual.squared_sigmas(turn[None])[0]), MOST_BY_ORDER)
+
+    def _steps(self, first: int, second: int) -> int:
+        """Steps of the camera from one frame to another."""
+        return self.captures[second] - self.captures[first]
 
     def solve(self, component: Component) -> PoseGraphSolution:
         """A component with the pairs that hold it optimised together, each where its frames are."""
@@ -397,18 +410,17 @@ class Turns:
     pair: Int64[ndarray, "n"]
 
     @staticmethod
-    def of(pairs: Sequence[PairMatch]) -> "Turns":
-        """Stack the places of pairs."""
+    def of(pairs: Sequence[PairMatch], steps: Sequence[int]) -> "Turns":
+        """Stack the places of pairs; `steps`: of the camera, from the source of each to its target."""
         turn, weight, number = list[Float64[ndarray, "3"]](), list[Float64[ndarray, "m"]](), list[int]()
-        for k, e in enumerate(pairs):
+        for k, (e, count) in enumerate(zip(pairs, steps, strict=True)):
             weight.append(softmax(np.array([one.log_odds for one in e.places]) / SHARED_ERRORS))
             number += [k] * len(e.places)
             for one in e.places:
-                S = one.S_target_source.inverse() if e.target > e.source else one.S_target_source
-                turn.append(turn_deg(S) / abs(e.target - e.source))
+                S = one.S_target_source.inverse() if count > 0 else one.S_target_source
+                turn.append(turn_deg(S) / abs(count))
         each = np.array(number, dtype=np.int64)
-        steps = np.array([abs(e.target - e.source) for e in pairs], dtype=np.float64)
-        return Turns(np.stack(turn), steps[each], np.concatenate(weight), each)
+        return Turns(np.stack(turn), np.abs(np.array(steps, dtype=np.float64))[each], np.concatenate(weight), each)
 
     def in_no_order(self) -> "Turns":
         """The same as if the frames of each pair followed each other."""

@@ -267,7 +267,7 @@ def test_frames_are_registered_again_only_if_they_have_no_order_and_all_of_them_
     monkeypatch.setattr(stages, "choose_projectors", lambda clouds, sequence, _: choices[sequence])
     monkeypatch.setattr(stages, "chosen_clouds", lambda clouds, chosen: chosen)
     monkeypatch.setattr(stages, "register", register)
-    chosen, found = stages.register_clouds([], unordered, 0, None, log.append)
+    chosen, found = stages.register_clouds([], (), unordered, 0, None, log.append)
     assert made == calls and chosen == calls[-1][0] and found.T_world_camera[0, 0, 0] == len(calls)
     compared_with_all = not in_order  # what all frames say of the projectors counts
     assert log == [ORDER] * compared_with_all

@@ -95,11 +95,11 @@ def test_pairs_that_surfaces_hold_confirm_tones_and_pairs_that_slip_do_not():
 # The order of capture, of pairs that are said to be registered.
 
 
-def graph_of(monkeypatch: pytest.MonkeyPatch, pairs: list[PairMatch]) -> ViewGraph:
+def graph_of(monkeypatch: pytest.MonkeyPatch, pairs: list[PairMatch], captures: list[int] | None = None) -> ViewGraph:
     """The frames of the ring below with given pairs."""
     said = {(e.source, e.target): e for e in pairs}
     monkeypatch.setattr(module, "register_pair", lambda frames, numbers, *_: said[numbers])
-    graph = ViewGraph(SEEN, {}, np.random.default_rng(0))
+    graph = ViewGraph(SEEN, {}, np.random.default_rng(0), captures)
     graph.try_pairs(list(said), NEIGHBOURS)
     return graph
 
@@ -127,6 +127,18 @@ def test_the_usual_step_is_that_which_makes_all_pairs_most_likely(monkeypatch):
     assert graph.usual_step(0, 1, turned(3.0)) < -LEAST_ODDS  # a tooth away: as small a turn, the other way round
     assert graph.usual_step(0, 2, turned(90.0)) == 0.0  # each step counts once
     assert graph.usual_step(0, 1, turned(170.0)) == -MOST_BY_ORDER  # someone may have walked to the other side
+
+
+def test_a_capture_that_shows_nothing_is_a_step_all_the_same(monkeypatch):
+    """The last frame was taken two steps after the one before."""
+    turns = [15.0 + k % 3 for k in range(FRAMES - 1)]
+    turns[-1] = 32.0
+    for captures, usual_deg in ((None, 16.0), ([*range(FRAMES - 1), FRAMES], 32.0)):
+        graph = graph_of(monkeypatch, walk(turns), captures)
+        graph.learn_step()
+        odds = {deg: graph.usual_step(FRAMES - 2, FRAMES - 1, turned(-deg)) for deg in (0.0, 16.0, 32.0, 48.0)}
+        assert max(odds, key=lambda deg: odds[deg]) == usual_deg
+    assert graph.step is not None and graph.step.deg == pytest.approx(16, abs=1)
 
 
 def test_where_surfaces_decide_nothing_small_steps_are_likely(monkeypatch):
