@@ -26,6 +26,7 @@ from sl_nerfstudio.registration.evidence import (
     UNDECODED,
     UNKNOWNS,
     Commonness,
+    Compared,
     FrameEvidence,
     KeptResiduals,
     PairEvidence,
@@ -376,6 +377,22 @@ def test_residuals_that_were_kept_are_in_units_of_the_noise_as_it_is_known_now(c
         np.testing.assert_array_equal(again, fresh)
         leads.append(float(again[0, 1]))
     assert leads[0] == leads[2] > 1.5 * leads[1] > 0
+
+
+def test_a_place_at_which_views_share_most_errors_is_not_the_less_likely_for_those_that_they_do_not(compared):
+    """Two places with the same few outliers; at the first, all other residuals are half as large."""
+    source, target, _ = compared
+    pair, common = PairEvidence(source, target), no_knowledge(source, target)
+    n = len(pair.area)
+    rng = np.random.default_rng(1)
+    bulk = np.tile(np.clip(rng.standard_normal(n), -2, 2).astype(np.float32), (2, 1)) * np.float32([[0.5], [1.0]])
+    outlier = rng.random(n) < 0.05
+    z = np.where(outlier, np.float32(4.5), bulk)
+    found = pair.scaled(Compared(z, np.full((2, n), JUDGED, np.int8), np.ones((2, n), np.float32)), (1.0, 1.0))
+    assert np.abs(pair.comparison(found, common).leads[0, 1]) < 1e-3
+    z[1, outlier] = 6.0
+    worse = replace(found, z=z.astype(np.float32))
+    assert pair.comparison(worse, common).leads[0, 1] > 1
 
 
 def in_units(frame: FrameEvidence, factor: float) -> FrameEvidence:
