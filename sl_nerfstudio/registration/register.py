@@ -282,6 +282,8 @@ def include_left_out(
 ) -> Registration:
     """The registration, at the adjusted poses, with those of `left_out` that can now be placed by more than one pair.
 
+    Pairs that slide along a side place none: the adjustment would only make a wrong place look certain.
+
     `clouds` have the adjusted relative poses; poses of frames that are not registered are NaN.
     """
     graph = ViewGraph(results([partial(Frame.of, c) for c in clouds]), {}, np.random.default_rng(seed))
