@@ -33,6 +33,7 @@ from sl_nerfstudio.registration.agreement import (
 from sl_nerfstudio.registration.evidence import (
     ABSENT,
     JUDGED,
+    LARGEST_NOISE,
     LEAST_ODDS,
     LEAST_SEEN,
     Commonness,
@@ -217,7 +218,8 @@ class PairMatch:
 
 def is_accepted(match: PairMatch) -> bool:
     """Whether two frames have a surface in common, wherever it is: what slips fits as well along its whole motion."""
-    return match.log_odds > (0.0 if match.slip_deg or match.by_tone else LEAST_ODDS)
+    least = 0.0 if match.slip_deg or match.by_tone else LEAST_ODDS
+    return match.log_odds > least and max(match.noise) < LARGEST_NOISE
 
 
 def is_ambiguous(match: PairMatch) -> bool:
