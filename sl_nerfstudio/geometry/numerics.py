@@ -1,4 +1,4 @@
-"""Least-squares planes from sums over points, for use in compiled loops."""
+"""Parts of a graph, robust kernels, even spacing, nearest distances, and planes from sums for compiled loops."""
 
 from typing import Any
 

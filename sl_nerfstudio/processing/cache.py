@@ -34,8 +34,8 @@ VERSIONS = {
     "projector": 1,  # estimated intrinsics: relative_pose/unknown_projector.py
     "test of intrinsics": 1,  # relative_pose/intrinsics.py
     "static projector": 1,  # registration/static_projector.py
-    "registration": 5,  # registration/
-    "adjustment": 6,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
+    "registration": 6,  # registration/
+    "adjustment": 7,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
 }
 """Number of each stage. Raise it whenever the stage, or anything that it calls, may give another result from the same
 inputs: another algorithm, constant, order of summation or field of a result. Names, comments and speed need none.

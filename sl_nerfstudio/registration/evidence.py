@@ -54,9 +54,9 @@ LARGEST_RESIDUAL = 100.0
 NOISE_QUANTILES = np.array([0.68, 0.95])  # of residuals, by which a pair's are compared with that density
 LARGEST_NOISE = 5.0  # factor: beyond it residuals are no noise, the place is wrong
 NOISE_RESIDUALS = np.array([1.06, 3.2])  # its quantiles there
+FEWEST_JUDGED = 50  # points by which noise is known
 USUAL_SIGMAS = 1.0  # of a residual in the right place
 INDISTINCT_SIGMAS = 3.0  # within which residuals say nothing of the place: views that are alike share errors
-FEWEST_JUDGED = 50  # points by which that is known
 ELSEWHERE_SIGMA = 12.0  # of a point that does not belong there: somewhere near, or anywhere
 
 USUAL_SHARE = 0.9  # of other places at which a point fits, before any was tried: most surface is smooth
