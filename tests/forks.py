@@ -24,7 +24,7 @@ _FORKS.set_forkserver_preload(["sl_nerfstudio.methods", "sl_nerfstudio.cli.proce
 
 def fork(work: Callable[..., object], *arguments: Any) -> ForkServerProcess:
     """Start some work, in silence; its function and arguments can be pickled."""
-    process = _FORKS.Process(target=_begin, args=(dict(os.environ), work, arguments), daemon=False)
+    process = _FORKS.Process(target=_begin, args=(dict(os.environ), work, arguments))
     process.start()
     return process
 

@@ -294,7 +294,7 @@ def include_left_out(
     }
     for k in left_out:
         graph.try_pairs(graph.bridges(main, {k: Similarity.identity()}), ANYWHERE)
-    assembly = graph.assembly([e for e in graph.edges if e.holds and not e.slip_deg], graph.evidence())
+    assembly = graph.assembly([e for e in graph.edges if not e.slip_deg], graph.evidence())
     placed: Component = {}
     singles: list[Component] = [{k: Similarity.identity()} for k in left_out]
     for block in (*_blocks(registration, left_out), *singles):

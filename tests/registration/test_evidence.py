@@ -391,8 +391,7 @@ def test_a_place_at_which_views_share_most_errors_is_not_the_less_likely_for_tho
     found = pair.scaled(Compared(z, np.full((2, n), JUDGED, np.int8), np.ones((2, n), np.float32)), (1.0, 1.0))
     assert np.abs(pair.comparison(found, common).leads[0, 1]) < 1e-3
     z[1, outlier] = 6.0
-    worse = replace(found, z=z.astype(np.float32))
-    assert pair.comparison(worse, common).leads[0, 1] > 1
+    assert pair.comparison(replace(found, z=z), common).leads[0, 1] > 1
 
 
 def in_units(frame: FrameEvidence, factor: float) -> FrameEvidence:
