@@ -246,5 +246,6 @@ def _anchors(rig: Rig, held_out: HeldOutPixels) -> Anchors:
     d_projector = (T[:, :3, :3] @ unproject(rig.projector, held_out.uv_projector)[..., None]).squeeze(-1)
     depth, _ = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], d_projector)
     # No map surrounds a held-out pixel, so there is no normal; "towards the camera" is accurate enough to choose the
-    # frames that see it.
-    return Anchors(held_out.frame, d_camera, held_out.uv_projector, torch.nan_to_num(depth, nan=1.0), -d_camera)
+    # frames that see it. Nor is there a roughness.
+    depth = torch.nan_to_num(depth, nan=1.0)
+    return Anchors(held_out.frame, d_camera, held_out.uv_projector, depth, -d_camera, torch.full_like(depth, torch.nan))

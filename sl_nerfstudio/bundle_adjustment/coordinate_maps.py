@@ -391,6 +391,7 @@ class MapSample:
     uv_projector: Float[Tensor, "n 2"]
     jacobian: Float[Tensor, "n 2 2"]  # d uv_projector / d uv_camera
     valid: Bool[Tensor, "n"]  # enough decoded pixels, and a paraboloid fits them
+    roughness: Float[Tensor, "n"]  # RMS distance of the window from it, projector pixels; infinite without a fit
 
 
 @dataclass(frozen=True)
@@ -500,7 +501,7 @@ class CoordinateMaps:
         saves the work.
         """
         fit, roughness = self._fit(frame, uv_camera, memory or WindowMemory.empty(frame.numpy()))
-        return MapSample(fit[:, 0], fit[:, 1:].transpose(1, 2), roughness < self.max_roughness)
+        return MapSample(fit[:, 0], fit[:, 1:].transpose(1, 2), roughness < self.max_roughness, roughness)
 
     def _fit(
         self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"], memory: WindowMemory

@@ -39,7 +39,7 @@ _STEP = 0.05  # pixels to either side, of differences that give normals
 _LEAST_ALIKE = 0.7  # cosine between normals at the same place
 NOISE_FLOOR_PX = 0.01  # smallest plausible noise of one look-up, pattern pixels
 _FASTEST = 1.4  # largest factor by which a kernel narrows in one step
-_OBLIQUENESS_CLASSES = 8  # of look-ups, by the cosine at which the camera sees the surface; each has its own noise
+_ROUGHNESS_CLASSES = 16  # of look-ups, by how rough the coordinates are; each has its own noise
 _LEAST_NOISE_RATIO = 0.5  # of such a class, relative to all look-ups
 _BORDER_CLASSES = 8  # of look-ups, by the distance from the border of what was decoded
 _MOST_BORDER_NOISE = 1.25  # of such a class, relative to all look-ups; beyond, it and those nearer to the border are
@@ -144,7 +144,7 @@ def anchors_at(
     seen = maps.look_up(frame, uv)
     p, normal, good = _surface(rig, frame, uv, seen)
     depth = p.norm(dim=-1)
-    return Anchors(frame, p / depth[:, None], seen.uv_projector, depth, normal), seen.valid & good
+    return Anchors(frame, p / depth[:, None], seen.uv_projector, depth, normal, seen.roughness), seen.valid & good
 
 
 def with_common_normals(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps) -> Anchors:
@@ -340,7 +340,7 @@ class Kernel:
     width: Float[Tensor, "frames"]  # projector pixels
     frame: Int[Tensor, "anchors"]
     pair: Int[Tensor, "2 rows"]  # frame of the anchor, frame that looks it up
-    noise_ratio: Float[Tensor, "rows"] | None = None  # noise of each look-up over the usual one: as much wider
+    ratios: tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]] | None = None  # see `noise_ratios`: as much wider
 
     @property
     def narrowest(self) -> float:
@@ -375,9 +375,10 @@ class Kernel:
         return self.narrowest**2 * sum(float(geman_mcclure_cost(r2 / w2).sum()) for r2, w2 in (own, cross))
 
     def _squares(self) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]:
-        cross = self.width[self.pair].amax(0)
-        cross = cross if self.noise_ratio is None else cross * self.noise_ratio
-        return self.width[self.frame] ** 2, cross**2
+        own, cross = self.width[self.frame], self.width[self.pair].amax(0)
+        if self.ratios is not None:
+            own, cross = own * self.ratios[0], cross * self.ratios[1]
+        return own**2, cross**2
 
 
 def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Float[Tensor, "frames"]:
@@ -421,19 +422,25 @@ def useful_distance(distance: Float[Tensor, "n"], size: Float[Tensor, "n"]) -> f
     return 0.0
 
 
-def noise_ratios(r: Residuals, cosine: Float[Tensor, "rows"]) -> Float[Tensor, "rows"]:
-    """Noise of each look-up over that of all, from the residuals of those that see their surface as obliquely.
+def noise_ratios(
+    r: Residuals, roughness: Float[Tensor, "anchors"], anchor: Int[Tensor, "rows"]
+) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "rows"]]:
+    """Noise of own and of cross residuals over that of all cross residuals, from those with coordinates as rough.
 
-    `cosine`: between the surface's normal and the line of sight. Classes hold equally many look-ups.
+    How far the pixels of a window are from a paraboloid (`roughness` of the anchors, `r.roughness` of what is looked
+    up, at `anchor`) shows the noise of decoding, and edges and grooves, over which a decoder smooths. A cross residual
+    has the errors of two windows, an own one those of one. Classes hold equally many look-ups.
     """
-    size, known = r.cross.norm(dim=-1), r.cross_valid
+    rough = torch.hypot(roughness[anchor], r.roughness)
+    size, known = r.cross.norm(dim=-1), r.cross_valid & rough.isfinite()
     if not known.any():
-        return torch.ones_like(size)
-    shares = np.linspace(0, 1, _OBLIQUENESS_CLASSES + 1)[1:-1]
-    group = torch.bucketize(cosine, torch.from_numpy(np.quantile(array(cosine[known]), shares)))
-    usual, ratio = size[known].median(), torch.ones_like(size)
-    for k in range(_OBLIQUENESS_CLASSES):
-        mine = group == k
-        if (mine & known).any():
-            ratio[mine] = size[mine & known].median() / usual.clamp_min(NOISE_FLOOR_PX)
-    return ratio.clamp_min(_LEAST_NOISE_RATIO)
+        return torch.ones_like(roughness), torch.ones_like(size)
+    shares = np.linspace(0, 1, _ROUGHNESS_CLASSES + 1)[1:-1]
+    edges = torch.from_numpy(np.quantile(array(rough[known]), shares))
+    group, usual = torch.bucketize(rough, edges), size[known].median().clamp_min(NOISE_FLOOR_PX)
+    ratio = torch.ones(_ROUGHNESS_CLASSES, dtype=size.dtype)
+    for k in range(_ROUGHNESS_CLASSES):
+        mine = known & (group == k)
+        if mine.any():
+            ratio[k] = (size[mine].median() / usual).clamp_min(_LEAST_NOISE_RATIO)
+    return ratio[torch.bucketize(2**0.5 * roughness, edges)], ratio[group]

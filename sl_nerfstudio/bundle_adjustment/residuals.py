@@ -34,9 +34,7 @@ from sl_nerfstudio.geometry.lie import (
     inverse_poses,
     moved,
     moved_poses,
-    rotate,
     row_times_rotation,
-    transform,
 )
 from sl_nerfstudio.parallel import compiled, compiled_range
 
@@ -235,6 +233,7 @@ class Anchors:
     uv_projector: Float[Tensor, "anchors 2"]  # decoded there
     depth: Float[Tensor, "anchors"]  # along the ray
     normal: Float[Tensor, "anchors 3"]  # of the surface there, in camera axes, towards the camera
+    roughness: Float[Tensor, "anchors"]  # of the coordinates around it, see `MapSample`
 
     def at(self, depth: Float[Tensor, "anchors"]) -> "Anchors":
         """The same anchors at other depths."""
@@ -269,6 +268,7 @@ class Residuals:
     own: Float[Tensor, "anchors 2"]
     cross: Float[Tensor, "rows 2"]
     cross_valid: Bool[Tensor, "rows"]
+    roughness: Float[Tensor, "rows"]  # of what was looked up, see `MapSample`
 
 
 @dataclass(frozen=True)
@@ -331,14 +331,6 @@ def pixels_of_rows(
     return torch.from_numpy(uv), torch.from_numpy(in_front)
 
 
-def viewing_cosines(rig: Rig, anchors: Anchors, observations: Observations) -> Float[Tensor, "rows"]:
-    """Cosine between the surface's normal and the line of sight of the camera that looks an anchor up."""
-    T, i = rig.T_world_camera, anchors.frame
-    p_world = transform(T[i], anchors.depth[:, None] * anchors.d_camera)[observations.anchor]
-    normal = rotate(T[i], anchors.normal)[observations.anchor]
-    return torch.nn.functional.cosine_similarity(normal, T[observations.frame, :3, 3] - p_world, dim=-1)
-
-
 def _residuals(
     rig: Rig, anchors: Anchors, observations: Observations, maps: CoordinateMaps, derivatives: tuple[Tensor, ...],
     own_place_px: float = 0.0,
@@ -355,7 +347,7 @@ def _residuals(
         len(cross), devices, *points, array(anchors.normal), array(observations.anchor), array(observations.frame),
         array(seen.uv_projector), array(seen.jacobian), own_place_px, cross, by_pose, by_depth,
     )  # fmt: skip
-    return Residuals(torch.from_numpy(own), torch.from_numpy(cross), seen.valid & in_front)
+    return Residuals(torch.from_numpy(own), torch.from_numpy(cross), seen.valid & in_front, seen.roughness)
 
 
 def array(tensor: Tensor) -> ndarray:

@@ -38,7 +38,6 @@ from sl_nerfstudio.bundle_adjustment.residuals import (
     linearise,
     pixels_of_rows,
     residuals_of,
-    viewing_cosines,
 )
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.devices import project
@@ -123,9 +122,9 @@ class SearchProgress:
 
 
 def kernel_of(state: LMState, rows: Observations, widths: Float[Tensor, "frames"], r: Residuals) -> Kernel:
-    """The kernel with the noise that look-ups have by how obliquely a camera sees the surface."""
-    cosine = viewing_cosines(state.rig, state.anchors, rows)
-    return Kernel(widths, state.anchors.frame, rows.pairs(state.anchors), noise_ratios(r, cosine))
+    """The kernel with the noise that residuals have by how rough the coordinates are."""
+    ratios = noise_ratios(r, state.anchors.roughness, rows.anchor)
+    return Kernel(widths, state.anchors.frame, rows.pairs(state.anchors), ratios)
 
 
 def problem_of(
@@ -182,6 +181,8 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
         noise = noise_of(r, float(torch.minimum(found.widths, target).min()))
         widths = narrowed(found.widths, target).clamp_min(_KERNEL_NOISES * noise)
         kernel = kernel_of(found.state, found.rows, widths, r)
+        if stage.rough:  # residuals are those of wrong poses, and largest where there is most to see
+            kernel = replace(kernel, ratios=None)
         per_frame = float(r.cross_valid.sum()) / start.frames
         weight = rough_weight(noise, per_frame, INDEPENDENT) if stage.rough else noise**2
         prior = PriorTerm(problem.prior, start, weight)
@@ -260,7 +261,7 @@ def _away_from_borders(problem: SearchProblem, found: SearchProgress) -> SearchP
     uv_own = project(state.rig.camera[anchors.frame], anchors.d_camera)[0]
     uv = torch.cat([uv_own, pixels_of_rows(state.rig, anchors, rows)[0]])
     own, seen = maps.border_distance(frame, uv).tensor_split([len(uv_own)])
-    size = r.cross.norm(dim=-1) / noise_ratios(r, viewing_cosines(state.rig, anchors, rows))
+    size = r.cross.norm(dim=-1) / noise_ratios(r, anchors.roughness, rows.anchor)[1]
     nearer = torch.minimum(own[rows.anchor], seen)
     least = useful_distance(nearer[r.cross_valid], size[r.cross_valid])
     if least <= 0:

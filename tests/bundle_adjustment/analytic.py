@@ -124,7 +124,7 @@ class ExactMaps(CoordinateMaps):
             valid = valid & (part_a == part) & (part_b == part) & columns[-1].isfinite().all(-1)
             for value, near in far:
                 valid = valid & (near == part) & value.isfinite().all(-1)
-        return MapSample(uv.nan_to_num(), torch.stack(columns, -1).nan_to_num(), valid)
+        return MapSample(uv.nan_to_num(), torch.stack(columns, -1).nan_to_num(), valid, torch.zeros(len(uv)).double())
 
 
 def disturbed(rig: Rig, seed: int = 0, degrees: float = 1.0, shift: float = 0.03, relative: float = 0.0) -> Rig:

@@ -248,7 +248,7 @@ def test_a_frame_of_another_scene_asks_for_no_searches_and_widens_nothing(monkey
     stranger = 2
     maps = noisy_maps(1, 0.3)
     monkeypatch.setattr(analytic, "BALLS", analytic.BALLS[:1])
-    strange = noisy_maps(2, 0.3).image(stranger).reshape(-1, 2).roll(SIZE // 5, 0).reshape(SIZE, SIZE, 2)
+    strange = noisy_maps(11, 0.3).image(stranger).reshape(-1, 2).roll(SIZE // 5, 0).reshape(SIZE, SIZE, 2)
     maps = CoordinateMaps.of([strange if frame == stranger else maps.image(frame) for frame in range(FEW)])
     one: Adjustment = find_minimum(disturbed(rig_of(FEW, SIZE), 1), maps, TIGHT, "free", SEVERAL)
     assert one.unplaced == (stranger,)

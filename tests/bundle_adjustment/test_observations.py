@@ -147,12 +147,17 @@ FRAME = torch.tensor([0, 0, 1, 2])  # of four anchors
 PAIR = torch.tensor([[0, 0, 1, 2, 2], [1, 2, 0, 0, 1]])  # of five rows
 
 
+def with_roughness(cross: torch.Tensor, rough: torch.Tensor, valid: torch.Tensor | None = None) -> Residuals:
+    valid = torch.ones(len(cross), dtype=torch.bool) if valid is None else valid
+    return Residuals(torch.zeros(1, 2).double(), cross, valid, rough)
+
+
 def residuals(seed: int, size: float = 1.0, invalid: bool = False) -> Residuals:
     generator = torch.Generator().manual_seed(seed)
     own, cross = (size * torch.randn(n, 2, generator=generator, dtype=torch.float64) for n in (4, 5))
     valid = torch.ones(5, dtype=torch.bool)
     valid[3] = not invalid
-    return Residuals(own, cross, valid)
+    return Residuals(own, cross, valid, torch.zeros(5).double())
 
 
 def kernel(*widths: float) -> Kernel:
@@ -189,7 +194,11 @@ def test_curvature_is_that_of_the_cost_relative_to_its_weights(seed, size, inval
 
 
 def test_a_gross_error_costs_the_same_at_any_width_and_what_cannot_be_seen_has_no_weight():
-    far = Residuals(*(torch.full((n, 2), 1e6, dtype=torch.float64) for n in (4, 5)), torch.ones(5, dtype=torch.bool))
+    far = Residuals(
+        *(torch.full((n, 2), 1e6, dtype=torch.float64) for n in (4, 5)),
+        torch.ones(5, dtype=torch.bool),
+        torch.zeros(5).double(),
+    )
     for widths in ((0.5, 2.0, 1.0), (0.5, 0.5, 0.5)):
         assert kernel(*widths).cost(far, far.cross_valid) == pytest.approx(9 * 0.5**2, rel=1e-6)
     r = residuals(1, invalid=True)
@@ -204,7 +213,7 @@ def test_medians_are_of_the_residuals_that_involve_a_frame_also_with_equal_value
     valid = torch.rand(len(values), generator=torch.Generator().manual_seed(seed)) < 0.8
     rows = torch.stack([size, torch.zeros_like(size)], -1)
     turned = torch.arange(len(values)) % 2
-    found = frame_medians(Residuals(torch.zeros(1, 2).double(), rows, valid), torch.stack([turned, 1 - turned]), 3)
+    found = frame_medians(with_roughness(rows, torch.zeros_like(size), valid), torch.stack([turned, 1 - turned]), 3)
     expected = size[valid].median() if valid.any() else torch.tensor(float("inf")).double()
     assert (found[:2] == expected).all() and torch.isinf(found[2])
 
@@ -221,27 +230,31 @@ def test_the_noise_is_the_robust_sigma_of_the_inliers():
     generator = torch.Generator().manual_seed(0)
     cross = 0.3 * torch.randn(20000, 2, generator=generator, dtype=torch.float64)
     cross[::10] += 50.0
-    r = Residuals(torch.zeros(1, 2).double(), cross, torch.ones(20000, dtype=torch.bool))
+    r = with_roughness(cross, torch.zeros(20000).double())
     assert noise_of(r, 0.9) == pytest.approx(0.3, rel=0.03)
-    exact = Residuals(r.own, torch.zeros_like(cross), r.cross_valid)
+    exact = replace(r, cross=torch.zeros_like(cross))
     assert noise_of(exact, 0.9) == observations.NOISE_FLOOR_PX
 
 
-def test_look_ups_that_see_obliquely_are_as_noisy_as_their_residuals_say():
-    """Residuals three times as large below a cosine of 0.5: their kernel is as much wider, their weight smaller."""
-    generator = torch.Generator().manual_seed(3)
-    cosine = torch.rand(20_000, generator=generator, dtype=torch.float64)
-    noise = torch.where(cosine < 0.5, 0.3, 0.1).double()
-    cross = noise[:, None] * torch.randn(20_000, 2, generator=generator, dtype=torch.float64)
-    r = Residuals(torch.zeros(1, 2).double(), cross, torch.ones(20_000, dtype=torch.bool))
-    ratio = noise_ratios(r, cosine)
-    assert ratio[cosine < 0.48].median() / ratio[cosine > 0.52].median() == pytest.approx(3.0, rel=0.1)
-    pair = torch.zeros(2, 20_000, dtype=torch.long)
-    one = Kernel(torch.tensor([1.0], dtype=torch.float64), torch.tensor([0]), pair, ratio)
-    exact = Residuals(r.own, torch.zeros_like(cross), r.cross_valid)
-    assert torch.allclose(one.weights(exact)[1], 1 / ratio**2)
-    none = Residuals(torch.zeros(1, 2).double(), torch.zeros(3, 2).double(), torch.zeros(3, dtype=torch.bool))
-    assert (noise_ratios(none, torch.rand(3).double()) == 1).all()
+def test_residuals_of_rough_coordinates_are_as_noisy_as_they_say():
+    """Twice as large where windows are rough: their kernel is as much wider, their weight smaller."""
+    generator, n = torch.Generator().manual_seed(3), 20_000
+    rough = torch.rand(n, generator=generator, dtype=torch.float64)
+    anchor = torch.arange(n) % 2  # one anchor is smooth, the other one rough
+    roughness = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    noise = torch.where(torch.hypot(rough, roughness[anchor]) > 0.5, 0.2, 0.1).double()
+    r = with_roughness(noise[:, None] * torch.randn(n, 2, generator=generator, dtype=torch.float64), rough)
+    own, cross = noise_ratios(r, roughness, anchor)
+    smooth = (anchor == 0) & (rough < 0.48)
+    assert cross[(anchor == 1) | (rough > 0.52)].median() / cross[smooth].median() == pytest.approx(2.0, rel=0.1)
+    assert own[1] / own[0] == pytest.approx(2.0, rel=0.1)
+    pair = torch.zeros(2, n, dtype=torch.long)
+    one = Kernel(torch.tensor([1.0], dtype=torch.float64), torch.tensor([0, 0]), pair, (own, cross))
+    exact = replace(r, own=torch.zeros(2, 2).double(), cross=torch.zeros_like(r.cross))
+    for weight, ratio in zip(one.weights(exact), (own, cross), strict=True):
+        assert torch.allclose(weight, 1 / ratio**2)
+    none = with_roughness(torch.zeros(3, 2).double(), torch.zeros(3).double(), torch.zeros(3, dtype=torch.bool))
+    assert all((ratio == 1).all() for ratio in noise_ratios(none, torch.zeros(1).double(), torch.zeros(3).long()))
 
 
 def noisy(worse_below: float, factor: float) -> tuple[torch.Tensor, torch.Tensor]:

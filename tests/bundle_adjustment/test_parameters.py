@@ -195,7 +195,7 @@ def adjusted(true: Rig, wrong: tuple[float, ...], sigma: float, refined: Intrins
     """Poses adjusted to perfect coordinates with other intrinsics than those that made them."""
     stated = replace(true, camera=changed(true.camera, wrong[:3]), projector=changed(true.projector, wrong[3:]))
     prior = replace(prior_of(true.frames, 0.03, 0.02, 0.05, 0.02, intrinsics=sigma), intrinsics_change=refined)
-    settings = AdjustmentSettings(anchors_per_frame=120, frames_per_anchor=3, max_iterations=14)
+    settings = AdjustmentSettings(anchors_per_frame=120, frames_per_anchor=3, max_iterations=40)
     return adjust(stated, ExactMaps.around(true, 100), prior, "free", settings)
 
 
@@ -211,7 +211,8 @@ def test_wrong_intrinsics_are_contradicted_and_measured_and_correct_ones_are_not
     found = adjusted(true, wrong, 0.02 if any(wrong) else 0.01)
     estimate = found.intrinsics
     assert estimate is not None and estimate.contradicts() == any(wrong)
-    assert torch.allclose(estimate.change, -torch.tensor(wrong).double(), rtol=0, atol=5e-4)  # one linear step
+    left = (estimate.change + torch.tensor(wrong).double()).abs()  # of one linear step
+    assert (left < 0.5 * estimate.covariance.diagonal().sqrt()).all() and float(left.max()) < 1.5e-3
     assert in_sigmas(found, true) < 1.5 or not any(wrong)
     if wrong[0]:  # assumed exact, they have too small an uncertainty
         assert in_sigmas(adjusted(true, wrong, 0.0), true) > 3

@@ -23,7 +23,7 @@ MANY = 10
 ROUND = (0.0, 0.0, 0.0, 0.45)  # a ball on the axis of the disk
 FEATURE = (0.25, 0.0, 0.38, 0.12)  # a smaller one on it, the only thing that shows how the object is turned
 LARGER = (0.3, 0.0, 0.3, 0.25)
-FEW_ANCHORS = AdjustmentSettings(200, frames_per_anchor=8, max_iterations=20, other_minima=False)
+FEW_ANCHORS = AdjustmentSettings(200, frames_per_anchor=8, max_iterations=40, other_minima=False)
 UNSTATED_DEG = USUAL_FRAME_ROTATION_DEG
 NOTHING_KNOWN = prior_of(MANY, *[1e6] * 4)
 
