@@ -474,8 +474,8 @@ class NewFolder:
             self._lock.add(json.dumps(old).encode() + b"\n")
         _remove(self.root, self._earlier)
         self._earlier = []
-        if not last:
-            self._lock.add(json.dumps(path).encode() + b"\n")
+        listed = beside(Path(path), PARTIAL).as_posix() if last else path
+        self._lock.add(json.dumps(listed).encode() + b"\n")
         self.digests[path] = hashlib.sha256(content).hexdigest()
         write_atomic(self.root / path, content)
 

@@ -35,7 +35,7 @@ from sl_nerfstudio.storage import (
     remove_partial,
     write_atomic,
 )
-from tests.forks import exit_status, fork
+from tests.forks import exit_status, fork, killed_at_change
 
 
 @contextmanager
@@ -414,6 +414,24 @@ def test_no_place_for_a_temporary_file_is_a_fault_of_the_user(monkeypatch, write
     monkeypatch.setattr(tempfile, "tempdir", "/dev/null/nowhere")
     with pytest.raises(UserError, match=r"temporary file.*\n.*\n.*TMPDIR"):
         write(np.zeros(3))
+
+
+def fill_two(root: Path) -> None:
+    with NewFolder(root) as folder:
+        folder.write("inner/first", b"1")
+        folder.write("last", b"2", last=True)
+
+
+def test_a_folder_that_was_not_finished_is_filled_again_whenever_its_process_was_killed(tmp_path):
+    """Also while the last file, which is never removed, was written."""
+    moments = 0
+    while killed_at_change(moments, fill_two, tmp_path / str(moments)):
+        root = tmp_path / str(moments)
+        if not (root / "last").exists():
+            fill_two(root)
+        assert files_below(root) == ["inner/first", "last"]
+        moments += 1
+    assert moments > 5
 
 
 def test_an_earlier_result_stays_until_the_first_new_file_and_with_anything_else_in_it_for_good(tmp_path):
