@@ -40,10 +40,11 @@ from ..bundle_adjustment.analytic import PROJECTORS, camera_of, disturbed, image
 pytestmark = pytest.mark.slow
 
 FRAMES, SIZE, MM = 6, 80, 50.0
+NOISE_PX = 0.05
 S_SCENE_WORLD = Similarity(1 / MM, np.eye(3), np.zeros(3))
 BAR = ScaleBar((PickedPixel("frame_00001", (41.0, 38.5)), PickedPixel("frame_00004", (36.0, 44.0))), 1.0)
 QUICK = AdjustmentSettings(
-    anchors_per_frame=80, frames_per_anchor=3, max_iterations=14, further_searches=False, other_minima=False
+    anchors_per_frame=80, frames_per_anchor=3, max_iterations=40, further_searches=False, other_minima=False
 )
 
 
@@ -68,6 +69,7 @@ def scan(true, tmp_path_factory) -> Scan:
     root: Path = tmp_path_factory.mktemp("adjust_scan") / "scan"
     blank = np.zeros((SIZE, SIZE), dtype=np.uint8)
     blank[::2] = 200
+    generator = torch.Generator().manual_seed(0)
     with ScanWriter(
         root,
         units="mm",
@@ -77,6 +79,7 @@ def scan(true, tmp_path_factory) -> Scan:
         camera=camera_of(SIZE),
     ) as writer:
         for k, (coords, c, p) in enumerate(zip(images_of(true, SIZE), *in_mm(true), strict=True)):
+            coords = coords + NOISE_PX * torch.randn(coords.shape, generator=generator)
             mask = coords.isfinite().all(-1).numpy()
             name = f"frame_{k:05d}"
             writer.add_frame(name, image=blank, coords=coords.numpy(), mask=mask, T_world_camera=c, T_world_projector=p)
