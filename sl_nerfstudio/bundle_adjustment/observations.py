@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float64, Int, Int64
 from numpy import ndarray
 from torch import Tensor
 
@@ -383,12 +383,18 @@ class Kernel:
 
 def frame_medians(r: Residuals, pair: Int[Tensor, "2 rows"], frames: int) -> Float[Tensor, "frames"]:
     """Lower median of the cross residuals that involve each frame; infinite if there are none."""
-    groups = Groups.of(array(pair[:, r.cross_valid]).ravel(), frames)
-    size, out = np.tile(array(r.cross[r.cross_valid].norm(dim=-1)), 2)[groups.entries], np.full(frames, np.inf)
+    size = np.tile(array(r.cross[r.cross_valid].norm(dim=-1)), 2)
+    return _lower_medians(array(pair[:, r.cross_valid]).ravel(), size, frames)
+
+
+def _lower_medians(group: Int64[ndarray, "n"], values: Float64[ndarray, "n"], count: int) -> Float[Tensor, "count"]:
+    """Lower median of the values of each group; infinite if there are none."""
+    groups, out = Groups.of(group, count), np.full(count, np.inf)
+    values = values[groups.entries]
     for k, (first, last) in enumerate(pairwise(groups.first.tolist())):
         if last > first:
             middle = (last - first - 1) // 2
-            out[k] = np.partition(size[first:last], middle)[middle]
+            out[k] = np.partition(values[first:last], middle)[middle]
     return torch.from_numpy(out)
 
 
@@ -438,9 +444,6 @@ def noise_ratios(
     shares = np.linspace(0, 1, _ROUGHNESS_CLASSES + 1)[1:-1]
     edges = torch.from_numpy(np.quantile(array(rough[known]), shares))
     group, usual = torch.bucketize(rough, edges), size[known].median().clamp_min(NOISE_FLOOR_PX)
-    ratio = torch.ones(_ROUGHNESS_CLASSES, dtype=size.dtype)
-    for k in range(_ROUGHNESS_CLASSES):
-        mine = known & (group == k)
-        if mine.any():
-            ratio[k] = (size[mine].median() / usual).clamp_min(_LEAST_NOISE_RATIO)
+    ratio = _lower_medians(array(group[known]), array(size[known]), _ROUGHNESS_CLASSES) / usual
+    ratio = torch.where(ratio.isfinite(), ratio, 1.0).clamp_min(_LEAST_NOISE_RATIO)
     return ratio[torch.bucketize(2**0.5 * roughness, edges)], ratio[group]

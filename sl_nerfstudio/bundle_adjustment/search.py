@@ -180,9 +180,10 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
         target = _KERNEL_MEDIANS * frame_medians(r, found.pairs, start.frames)
         noise = noise_of(r, float(torch.minimum(found.widths, target).min()))
         widths = narrowed(found.widths, target).clamp_min(_KERNEL_NOISES * noise)
-        kernel = kernel_of(found.state, found.rows, widths, r)
         if stage.rough:  # residuals are those of wrong poses, and largest where there is most to see
-            kernel = replace(kernel, ratios=None)
+            kernel = Kernel(widths, found.state.anchors.frame, found.pairs)
+        else:
+            kernel = kernel_of(found.state, found.rows, widths, r)
         per_frame = float(r.cross_valid.sum()) / start.frames
         weight = rough_weight(noise, per_frame, INDEPENDENT) if stage.rough else noise**2
         prior = PriorTerm(problem.prior, start, weight)
