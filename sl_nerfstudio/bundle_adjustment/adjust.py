@@ -41,6 +41,7 @@ from sl_nerfstudio.bundle_adjustment.search import (
     kernel_of,
     problem_of,
     search,
+    with_more_anchors,
 )
 from sl_nerfstudio.geometry.devices import unproject
 from sl_nerfstudio.geometry.triangulation import closest_approach
@@ -96,6 +97,8 @@ def find_minimum(
     if first is None:
         return _unmoved(start, prior, free_parameters(refine, start))
     found = explore(problem, refine, _likelier(problem, refine, first[0]))
+    if refine in FRAMES_MOVE:
+        found = replace(found, best=with_more_anchors(found.problem, refine, found.best))
     return replace(_result(found, first[1]), explored=found)
 
 

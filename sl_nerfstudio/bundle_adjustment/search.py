@@ -47,6 +47,7 @@ FRAMES_MOVE = ("free", "rigid-rig", "known-rig")
 
 LEAST_COSINE = 0.1  # between surface normal and ray; below it a device counts as not seeing a point
 PARTNERS = 64  # frames, about, in which anchors of one frame may be looked up: many frames take time by their number
+_MORE_ANCHORS = 3  # times as many in the last steps
 _LEAST_ANCHORS = 60  # of each frame, however many frames there are
 _RIGID_ITERATIONS = 5  # steps in which frames move as a whole, before projectors move relative to their cameras
 _OBSERVE_EVERY = 4  # steps between new choices of which frame sees which anchor
@@ -114,6 +115,7 @@ class SearchProgress:
     widths: Float[Tensor, "frames"]  # of each frame's kernel
     noise: float
     iterations: int
+    alike: int = 1  # look-ups that share errors, and count as one against the prior
 
     @property
     def pairs(self) -> Int[Tensor, "2 rows"]:
@@ -157,11 +159,14 @@ def stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[SearchStag
     counted as thousands, they would overrule the prior along directions that they hardly determine, and the scene would
     drift.
     """
-    rough = max(settings.max_iterations // 2 - _RIGID_ITERATIONS, 1)
-    found = [SearchStage(refine, True, rough), SearchStage(refine, False, settings.max_iterations)]
+    found = [SearchStage(refine, True, _rough_steps(settings)), SearchStage(refine, False, settings.max_iterations)]
     if refine in ("free", "rigid-rig"):  # a static projector is already in place
         found.insert(0, SearchStage("known-rig", True, _RIGID_ITERATIONS))
     return found
+
+
+def _rough_steps(settings: AdjustmentSettings) -> int:
+    return max(settings.max_iterations // 2 - _RIGID_ITERATIONS, 1)
 
 
 def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress) -> SearchProgress:
@@ -185,14 +190,14 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
         else:
             kernel = kernel_of(found.state, found.rows, widths, r)
         per_frame = float(r.cross_valid.sum()) / start.frames
-        weight = rough_weight(noise, per_frame, INDEPENDENT) if stage.rough else noise**2
+        weight = rough_weight(noise, per_frame, INDEPENDENT) if stage.rough else found.alike * noise**2
         prior = PriorTerm(problem.prior, start, weight)
         free = free_parameters(stage.refine, found.state.rig)
         state = lm_step(found.state, linear, found.rows, maps, kernel, prior, free)
         # a step may also be small because it was damped
         small = state.size < _CONVERGED and (state.damping < 1 or state.size == 0)
         settled = bool((widths >= _SETTLED * found.widths).all()) and small
-        found = SearchProgress(state, found.rows, widths, noise, found.iterations + 1)
+        found = SearchProgress(state, found.rows, widths, noise, found.iterations + 1, found.alike)
         if settled:
             break
     return found
@@ -237,17 +242,34 @@ def along_surface(problem: SearchProblem, refine: RefinePoses, found: SearchProg
     """More steps from the end of a search, along directions in which the surface slides.
 
     There the noise of slopes looks like information, so steps by the slopes of single look-ups are a hundredth of what
-    they should be. These are by the surface's normals, but the last ones: details of the surface that are smaller than
-    the windows of normals show in single look-ups alone.
+    they should be. These are by the surface's normals.
     """
-    here = problem_of(problem.start, problem.maps, problem.prior, problem.settings, found.state.rig)
+    here, found = _observed_anew(problem, problem.settings, found)
+    return run_stage(here, SearchStage(refine, True, _rough_steps(problem.settings), OWN_PLACE_PX), found)
+
+
+def with_more_anchors(problem: SearchProblem, refine: RefinePoses, found: SearchProgress) -> SearchProgress:
+    """The last steps of a search, with so many decoded pixels that the choice of them hardly matters.
+
+    First by the surface's normals, then by the slopes of single look-ups: details of the surface that are smaller than
+    the windows of normals show in those alone.
+    """
+    s = problem.settings
+    many = replace(s, anchors_per_frame=_MORE_ANCHORS * s.anchors_per_frame, max_anchors=_MORE_ANCHORS * s.max_anchors)
+    here, found = _observed_anew(problem, many, found)
+    found = _away_from_borders(here, replace(found, alike=_MORE_ANCHORS))
+    for steps, own_place_px in ((s.max_iterations // 8, OWN_PLACE_PX), (s.max_iterations // 4, 0.0)):
+        found = run_stage(here, SearchStage(refine, False, steps, own_place_px), found)
+    return found
+
+
+def _observed_anew(
+    problem: SearchProblem, settings: AdjustmentSettings, found: SearchProgress
+) -> tuple[SearchProblem, SearchProgress]:
+    """The same search from where it has come to, with new anchors."""
+    here = problem_of(problem.start, problem.maps, problem.prior, settings, found.state.rig)
     state = LMState(found.state.rig, here.anchors, DAMPING)
-    found = replace(found, state=state, rows=here.observe(state))
-    steps = problem.settings.max_iterations
-    found = run_stage(here, SearchStage(refine, True, steps, OWN_PLACE_PX), found)
-    found = _away_from_borders(here, found)
-    found = run_stage(here, SearchStage(refine, False, steps, OWN_PLACE_PX), found)
-    return run_stage(here, SearchStage(refine, False, steps, 0.0), found)
+    return here, replace(found, state=state, rows=here.observe(state))
 
 
 def _away_from_borders(problem: SearchProblem, found: SearchProgress) -> SearchProgress:

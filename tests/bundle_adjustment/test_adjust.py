@@ -189,7 +189,7 @@ def test_errors_that_all_frames_share_near_borders_do_not_turn_the_cameras(monke
         monkeypatch.setattr(observations, "_MOST_BORDER_NOISE", limit)
         found = adjust(disturbed(true), maps, PRIOR, "known-rig", replace(QUICK, anchors_per_frame=300))
         turns.append(errors(found.rig, true)[0])
-    assert turns[0] < 0.7 * turns[1]
+    assert turns[0] < 0.9 * turns[1]
 
 
 # Other minima.
