@@ -217,9 +217,13 @@ class PairMatch:
 
 
 def is_accepted(match: PairMatch) -> bool:
-    """Whether two frames have a surface in common, wherever it is: what slips fits as well along its whole motion."""
-    least = 0.0 if match.slip_deg or match.by_tone else LEAST_ODDS
-    return match.log_odds > least and max(match.noise) < LARGEST_NOISE
+    """Whether two frames have a surface in common, wherever it is.
+
+    What slips fits as well along its whole motion, so that no odds show it; the size of its residuals does.
+    """
+    if match.slip_deg or match.by_tone:
+        return match.log_odds > 0 and max(match.noise) < LARGEST_NOISE
+    return match.log_odds > LEAST_ODDS
 
 
 def is_ambiguous(match: PairMatch) -> bool:
