@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.registration import pairs
 from sl_nerfstudio.registration.agreement import Hypotheses, Side, Tolerance
-from sl_nerfstudio.registration.evidence import Commonness, Frame
+from sl_nerfstudio.registration.evidence import LARGEST_NOISE, Commonness, Frame
 from sl_nerfstudio.registration.pairs import (
     ANYWHERE,
     LEAST_ODDS,
@@ -220,6 +220,12 @@ def test_a_pair_is_accepted_by_its_odds_and_ambiguous_by_its_rivals(odds, rivals
     assert is_accepted(found) is (odds > LEAST_ODDS)
     assert is_ambiguous(found) is any(rival > -LEAST_ODDS for rival in rivals)
     assert (found.lead > LEAST_ODDS) is (is_accepted(found) and not any(rival >= -LEAST_ODDS for rival in rivals))
+
+
+def test_what_slips_needs_no_odds_but_residuals_that_are_noise():
+    slips = replace(match(LEAST_ODDS / 2), slip_deg=5.0)
+    assert is_accepted(slips) and not is_accepted(replace(slips, noise=(1.0, LARGEST_NOISE)))
+    assert is_accepted(replace(match(), noise=(1.0, LARGEST_NOISE)))  # its other places may be right
 
 
 def about_x(deg: float) -> Similarity:
