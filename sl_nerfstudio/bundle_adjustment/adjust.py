@@ -96,16 +96,15 @@ def find_minimum(
     first = search(problem, refine)
     if first is None:
         return _unmoved(start, prior, free_parameters(refine, start))
-    found = explore(problem, refine, _likelier(problem, refine, first[0]))
-    if refine in FRAMES_MOVE:
+    moves = refine in FRAMES_MOVE
+    found = explore(problem, refine, _likelier(problem, refine, first[0]) if moves else first[0])
+    if moves:
         found = replace(found, best=with_more_anchors(found.problem, refine, found.best))
     return replace(_result(found, first[1]), explored=found)
 
 
 def _likelier(problem: SearchProblem, refine: RefinePoses, first: SearchProgress) -> SearchProgress:
     """The end of a search, or where more steps along the surface lead, if that is more probable."""
-    if refine not in FRAMES_MOVE:
-        return first
     end = along_surface(problem, refine, first)
     better = odds(problem, end.state.rig, first.state.rig, min(end.noise, first.noise)).better
     return end if better else first

@@ -197,7 +197,7 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
         # a step may also be small because it was damped
         small = state.size < _CONVERGED and (state.damping < 1 or state.size == 0)
         settled = bool((widths >= _SETTLED * found.widths).all()) and small
-        found = SearchProgress(state, found.rows, widths, noise, found.iterations + 1, found.alike)
+        found = replace(found, state=state, widths=widths, noise=noise, iterations=found.iterations + 1)
         if settled:
             break
     return found
