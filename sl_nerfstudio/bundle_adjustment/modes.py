@@ -45,6 +45,7 @@ from sl_nerfstudio.bundle_adjustment.search import (
     search,
     unplaced_frames,
 )
+from sl_nerfstudio.bundle_adjustment.slides import with_slides
 from sl_nerfstudio.geometry.lie import exp_se3, exp_so3, inverse, log_se3, log_so3
 from sl_nerfstudio.parallel import results
 
@@ -181,8 +182,8 @@ def with_others(
     """The covariance's factor, wider by what other ends in the same valley differ, and the modes beyond it.
 
     Further searches begin at poses as uncertain as the starting ones, which are their prior, if the result, shaken,
-    does not lead back. Ends in its valley count by what look-ups say, as it may be within its error. Frames that no
-    search has placed are passed over.
+    does not lead back. Ends in its valley count by what look-ups say, as it may be within its error. Then each frame
+    alone may have slid (`slides`). Frames that no search has placed are passed over.
     """
     problem, rig, noise = found.problem, found.rig, found.best.noise
     if not (problem.settings.other_minima and found.may_differ):
@@ -205,7 +206,9 @@ def with_others(
         elif said.nats > log(_LEAST_WEIGHT) and all(_apart(problem, end, mode, noise) for _, mode in modes):
             modes.append((said, end))
     modes.sort(key=lambda mode: -mode[0].nats)
-    return widened(factor, near), tuple(_mode(said, other, rig) for said, other in modes)
+    placed = [k for k in range(rig.frames) if k not in unplaced]
+    factor = with_slides(problem, found.refine, found.best, widened(factor, near), placed)
+    return factor, tuple(_mode(said, other, rig) for said, other in modes)
 
 
 def _apart(problem: SearchProblem, one: Rig, two: Rig, noise: float) -> bool:

@@ -32,6 +32,8 @@ from sl_nerfstudio.bundle_adjustment.search import (
 from sl_nerfstudio.geometry.numerics import geman_mcclure_cost
 
 _COMPARED_ANCHORS = 300  # decoded pixels of each frame that are looked up
+_FRAME_ANCHORS = 1500  # the same of a frame that alone is in question
+_OF_OTHERS = 25  # one in so many of those of the other frames
 _COMPARED_NOISES = 4.0  # residual at which a look-up costs half of what a contradiction costs
 _NATS = _COMPARED_NOISES**2 / 2  # cost of a look-up that contradicts, however far off it is
 _HIDDEN = 2.0  # widths of the kernel from which on a nearer surface is another one, which hides the anchor
@@ -71,24 +73,61 @@ def odds(problem: SearchProblem, one: Rig, two: Rig, noise: float) -> Odds:
     """
     generator = torch.Generator().manual_seed(problem.settings.seed)
     frame, uv = problem.maps.draw(torch.arange(one.frames), _COMPARED_ANCHORS, generator)
-    (mine, good), (theirs, as_good) = (anchors_at(rig, problem.maps, frame, uv) for rig in (one, two))
+    gain, block, common = _gains(problem.maps, (one, two), noise, frame, uv, generator)
+    share = min(INDEPENDENT * one.frames / max(common, 1), 1.0)
+    mean, error = mean_and_error(share * gain, block)
+    prior = prior_cost(problem.prior, problem.start, two) - prior_cost(problem.prior, problem.start, one)
+    return Odds(mean * len(gain), prior, error * len(gain))
+
+
+def frame_lead(
+    problem: SearchProblem, one: Rig, two: Rig, noise: float, frame: int,
+    pixels: tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]],
+) -> float:  # fmt: skip
+    """By how many of its standard errors one rig is more probable than another that differs by a single frame.
+
+    By the look-ups alone, of many decoded `pixels` of that frame, and of some of those of the others (see
+    `many_pixels`).
+    """
+    owner, uv = pixels
+    chosen = owner == frame
+    chosen[::_OF_OTHERS] = True
+    generator = torch.Generator().manual_seed(problem.settings.seed)
+    gain, block, _ = _gains(problem.maps, (one, two), noise, owner[chosen], uv[chosen], generator, frame)
+    mean, error = mean_and_error(gain, block)
+    return mean / error if error > 0 else 0.0
+
+
+def many_pixels(problem: SearchProblem) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]]:
+    """Many decoded pixels of every frame: whose they are, and where."""
+    generator = torch.Generator().manual_seed(problem.settings.seed)
+    return problem.maps.draw(torch.arange(problem.start.frames), _FRAME_ANCHORS, generator)
+
+
+def _gains(
+    maps: CoordinateMaps, rigs: tuple[Rig, Rig], noise: float, frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"],
+    generator: torch.Generator, only: int | None = None,
+) -> tuple[Float[Tensor, "gains"], Int[Tensor, "gains"], int]:  # fmt: skip
+    """What the first of two rigs gains over the second, nats, with the block of the image of each gain.
+
+    Gains of the decoded pixels' own residuals, then of look-ups that exist at both; and the number of the latter.
+    `only`: the frame that these involve, as anchor or as viewer.
+    """
+    (mine, good), (theirs, as_good) = (anchors_at(rig, maps, frame, uv) for rig in rigs)
     both = good & as_good
-    ends = [(one, mine.chosen(both)), (two, theirs.chosen(both))]
-    rows = _common(problem.maps, ends, generator)
-    found = [residuals_of(rig, anchors, rows, problem.maps) for rig, anchors in ends]
+    ends = [(rigs[0], mine.chosen(both)), (rigs[1], theirs.chosen(both))]
+    rows = _common(maps, ends, generator, only)
+    found = [residuals_of(rig, anchors, rows, maps) for rig, anchors in ends]
     width = _COMPARED_NOISES * noise
     common = found[0].cross_valid & found[1].cross_valid
     for (rig, anchors), r in zip(ends, found, strict=True):
-        far = r.cross.norm(dim=-1) > _HIDDEN * width
-        common &= ~(far & in_front_of(rig, anchors, rows, problem.maps))
+        far = (common & (r.cross.norm(dim=-1) > _HIDDEN * width)).nonzero()[:, 0]
+        hidden = in_front_of(rig, anchors, Observations(rows.anchor[far], rows.frame[far]), maps)
+        common[far[hidden]] = False
     costs = [geman_mcclure_cost((torch.cat([r.own, r.cross[common]]) / width).square().sum(-1)) for r in found]
-    share = min(INDEPENDENT * one.frames / max(int(common.sum()), 1), 1.0)
-    gain = _NATS * share * (costs[1] - costs[0])
     cell = (uv[both] / _BLOCK).long()
     block = (frame[both] * _MOST_CELLS + cell[:, 1]) * _MOST_CELLS + cell[:, 0]
-    mean, error = mean_and_error(gain, torch.cat([block, block[rows.anchor[common]]]))
-    prior = prior_cost(problem.prior, problem.start, two) - prior_cost(problem.prior, problem.start, one)
-    return Odds(mean * len(gain), prior, error * len(gain))
+    return _NATS * (costs[1] - costs[0]), torch.cat([block, block[rows.anchor[common]]]), int(common.sum())
 
 
 def prior_cost(prior: PosePrior, start: Rig, rig: Rig) -> float:
@@ -127,9 +166,14 @@ def mean_and_error(values: Float[Tensor, "n"], block: Int[Tensor, "n"]) -> tuple
     return float(mean), float((blocks / (blocks - 1) * (sums**2).sum()).sqrt() / len(values))
 
 
-def _common(maps: CoordinateMaps, ends: list[tuple[Rig, Anchors]], generator: torch.Generator) -> Observations:
+def _common(
+    maps: CoordinateMaps, ends: list[tuple[Rig, Anchors]], generator: torch.Generator, only: int | None
+) -> Observations:
     """Anchors in frames that see them at both ends; a random choice of these if there are too many."""
     allowed = torch.stack([partners(*end, maps, PARTNERS, LEAST_COSINE, generator) for end in ends]).any(0)
+    if only is not None:
+        frame = torch.arange(len(allowed)) == only
+        allowed &= frame | frame[:, None]
     first, second = (_numbers(maps, *end, allowed, generator) for end in ends)
     common = first[torch.isin(first, second)]
     most = EVERY_FRAME_PER_ANCHOR * len(ends[0][1].frame)

@@ -1,0 +1,89 @@
+"""How far single frames may have slid: the likelihood along the motion in which each is known least.
+
+A covariance holds where residuals grow in proportion to a motion. Where few details hold a frame, as the holes of a
+flange hold it about its axis, it leaves them after some tenths of a degree; farther on, look-ups contradict as they do
+anywhere, and the likelihood may rise again. So it is asked on both sides, 4, 8, 16... sigma away (a slice of the
+likelihood: Pawitan, In All Likelihood, 2001, section 3.4), of many pixels of the frame. A place s away whose look-ups
+are preferred by z standard errors counts exp(z s / sigma): on a parabola whose maximum has the standard error sigma,
+those of the right place would be preferred by s / (2 sigma).
+"""
+
+from collections.abc import Callable
+from math import exp, pi
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
+from sl_nerfstudio.bundle_adjustment.parameters import PriorTerm, RefinePoses, free_parameters, rough_weight
+from sl_nerfstudio.bundle_adjustment.posterior import frame_lead, many_pixels
+from sl_nerfstudio.bundle_adjustment.residuals import OWN_PLACE_PX, linearise
+from sl_nerfstudio.bundle_adjustment.search import INDEPENDENT, SearchProblem, SearchProgress, kernel_of
+
+_FIRST_SIGMAS = 4.0  # distance at which a frame is tried first; then twice as far each time
+_PRIOR_SIGMAS = 2.0  # uncertainties of the starting pose up to which it is
+_PARABOLA_SIGMAS = 6.0  # beyond which the parabola no longer holds: contradictions cost no more
+_DECIDED = 2.0  # standard errors by which look-ups speak against both places: none farther off is tried
+_CELL = 0.75  # of a distance, that a place stands for: half-way to those half as far and twice as far away
+
+
+def with_slides(
+    problem: SearchProblem, refine: RefinePoses, found: SearchProgress, factor: Float[Tensor, "joint k"],
+    frames: list[int],
+) -> Float[Tensor, "joint more"]:  # fmt: skip
+    """The covariance's factor, wider by how far some of the frames may have slid, each by itself."""
+    directions, n = least_known_motions(problem, refine, found), found.state.rig.frames
+    pixels, columns = many_pixels(problem), []
+    for k in frames:
+        motion = torch.zeros(2, n, 6, dtype=torch.float64)
+        motion[:, k] = directions[k].reshape(2, 6)
+        sigma = float((motion.flatten() @ factor[: 12 * n]).norm())
+        prior = float((motion[:, k].flatten() / problem.prior.sigma[k]).norm().reciprocal())
+
+        def lead(distance: float, k: int = k, motion: Tensor = motion) -> float:
+            step = distance * motion
+            moved = found.state.rig.moved(step[0], step[1])
+            return frame_lead(problem, moved, found.state.rig, found.noise, k, pixels)
+
+        size = how_far(lead, sigma, prior) if sigma > 0 else 0.0
+        if size > 0:
+            columns.append(torch.nn.functional.pad(size * motion.flatten(), (0, len(factor) - 12 * n)))
+    return torch.cat([factor, *(column[:, None] for column in columns)], 1)
+
+
+def least_known_motions(
+    problem: SearchProblem, refine: RefinePoses, found: SearchProgress
+) -> Float[Tensor, "frames 12"]:
+    """Increment of unit length (scene units, radian) of each frame that its look-ups and its prior know least.
+
+    By the slopes of the surface's normals, with the look-ups of a frame counted as few.
+    """
+    rig, maps = found.state.rig, problem.maps
+    linear = linearise(rig, found.state.anchors, found.rows, maps, OWN_PLACE_PX)
+    r = linear.residuals
+    kernel = kernel_of(found.state, found.rows, found.widths, r)
+    per_frame = float(r.cross_valid.sum()) / rig.frames
+    prior = PriorTerm(problem.prior, problem.start, rough_weight(found.noise, per_frame, INDEPENDENT))
+    H = normal_equations(linear, found.rows, *kernel.weights(r)).H + prior.equations(rig)[0]
+    own = free_parameters(refine, rig).own
+    least = torch.linalg.eigh(own.mT @ H @ own).eigenvectors[:, :, :1]
+    return torch.nn.functional.normalize((own @ least)[..., 0], dim=1)
+
+
+def how_far(lead: Callable[[float], float], sigma: float, prior: float) -> float:
+    """RMS distance at which a frame may be along a motion, beyond its sigma there.
+
+    `lead`: by how many standard errors look-ups prefer the place at a signed distance. `prior`: sigma of its start.
+    """
+    distance, mass, square = _FIRST_SIGMAS * sigma, (2 * pi) ** 0.5 * sigma, 0.0
+    while distance <= _PRIOR_SIGMAS * prior:
+        leads = lead(distance), lead(-distance)
+        for one in leads:
+            odds = min(one * min(distance / sigma, _PARABOLA_SIGMAS), 0.0) - 0.5 * (distance / prior) ** 2
+            cell = _CELL * distance * exp(odds)
+            mass, square = mass + cell, square + cell * distance**2
+        if max(leads) < -_DECIDED:
+            break
+        distance *= 2
+    return (square / mass) ** 0.5
