@@ -9,10 +9,11 @@ those of the right place would be preferred by s / (2 sigma).
 """
 
 from collections.abc import Callable
+from functools import partial
 from math import exp, pi
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
@@ -40,16 +41,20 @@ def with_slides(
         motion[:, k] = directions[k].reshape(2, 6)
         sigma = float((motion.flatten() @ factor[: 12 * n]).norm())
         prior = float((motion[:, k].flatten() / problem.prior.sigma[k]).norm().reciprocal())
-
-        def lead(distance: float, k: int = k, motion: Tensor = motion) -> float:
-            step = distance * motion
-            moved = found.state.rig.moved(step[0], step[1])
-            return frame_lead(problem, moved, found.state.rig, found.noise, k, pixels)
-
+        lead = partial(_lead_at, problem, found, k, motion, pixels)
         size = how_far(lead, sigma, prior) if sigma > 0 else 0.0
         if size > 0:
             columns.append(torch.nn.functional.pad(size * motion.flatten(), (0, len(factor) - 12 * n)))
     return torch.cat([factor, *(column[:, None] for column in columns)], 1)
+
+
+def _lead_at(
+    problem: SearchProblem, found: SearchProgress, frame: int, motion: Float[Tensor, "2 frames 6"],
+    pixels: tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]], distance: float,
+) -> float:  # fmt: skip
+    """By how many standard errors look-ups prefer a frame at a distance along a motion to where it is."""
+    rig, (delta, rho) = found.state.rig, distance * motion
+    return frame_lead(problem, rig.moved(delta, rho), rig, found.noise, frame, pixels)
 
 
 def least_known_motions(
