@@ -19,8 +19,9 @@ from torch import Tensor
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.parameters import PriorTerm, RefinePoses, free_parameters, rough_weight
 from sl_nerfstudio.bundle_adjustment.posterior import frame_lead, many_pixels
-from sl_nerfstudio.bundle_adjustment.residuals import OWN_PLACE_PX, linearise
+from sl_nerfstudio.bundle_adjustment.residuals import OWN_PLACE_PX, Rig, linearise
 from sl_nerfstudio.bundle_adjustment.search import INDEPENDENT, SearchProblem, SearchProgress, kernel_of
+from sl_nerfstudio.parallel import results
 
 _FIRST_SIGMAS = 4.0  # distance at which a frame is tried first; then twice as far each time
 _PRIOR_SIGMAS = 2.0  # uncertainties of the starting pose up to which it is
@@ -34,27 +35,26 @@ def with_slides(
     frames: list[int],
 ) -> Float[Tensor, "joint more"]:  # fmt: skip
     """The covariance's factor, wider by how far some of the frames may have slid, each by itself."""
-    directions, n = least_known_motions(problem, refine, found), found.state.rig.frames
-    pixels, columns = many_pixels(problem), []
-    for k in frames:
-        motion = torch.zeros(2, n, 6, dtype=torch.float64)
+    n, rig = found.state.rig.frames, found.state.rig
+    directions, pixels = least_known_motions(problem, refine, found), many_pixels(problem)
+    motions, asked = torch.zeros(len(frames), 2, n, 6, dtype=torch.float64), []
+    for motion, k in zip(motions, frames, strict=True):
         motion[:, k] = directions[k].reshape(2, 6)
         sigma = float((motion.flatten() @ factor[: 12 * n]).norm())
-        prior = float((motion[:, k].flatten() / problem.prior.sigma[k]).norm().reciprocal())
-        lead = partial(_lead_at, problem, found, k, motion, pixels)
-        size = how_far(lead, sigma, prior) if sigma > 0 else 0.0
-        if size > 0:
-            columns.append(torch.nn.functional.pad(size * motion.flatten(), (0, len(factor) - 12 * n)))
-    return torch.cat([factor, *(column[:, None] for column in columns)], 1)
+        prior = float((directions[k] / problem.prior.sigma[k]).norm().reciprocal())
+        asked.append(partial(how_far, partial(_lead_at, problem, rig, found.noise, k, motion, pixels), sigma, prior))
+    sizes = torch.tensor(results(asked), dtype=torch.float64)
+    columns = (sizes[:, None] * motions.flatten(1)).mT[:, sizes > 0]
+    return torch.cat([factor, torch.nn.functional.pad(columns, (0, 0, 0, len(factor) - 12 * n))], 1)
 
 
 def _lead_at(
-    problem: SearchProblem, found: SearchProgress, frame: int, motion: Float[Tensor, "2 frames 6"],
+    problem: SearchProblem, rig: Rig, noise: float, frame: int, motion: Float[Tensor, "2 frames 6"],
     pixels: tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]], distance: float,
 ) -> float:  # fmt: skip
     """By how many standard errors look-ups prefer a frame at a distance along a motion to where it is."""
-    rig, (delta, rho) = found.state.rig, distance * motion
-    return frame_lead(problem, rig.moved(delta, rho), rig, found.noise, frame, pixels)
+    moved = rig.moved(distance * motion[0], distance * motion[1])
+    return frame_lead(problem, moved, rig, noise, frame, pixels)
 
 
 def least_known_motions(
@@ -82,6 +82,8 @@ def how_far(lead: Callable[[float], float], sigma: float, prior: float) -> float
     `lead`: by how many standard errors look-ups prefer the place at a signed distance. `prior`: sigma of its start.
     """
     distance, mass, square = _FIRST_SIGMAS * sigma, (2 * pi) ** 0.5 * sigma, 0.0
+    if not sigma:
+        return 0.0
     while distance <= _PRIOR_SIGMAS * prior:
         leads = lead(distance), lead(-distance)
         for one in leads:
