@@ -33,7 +33,8 @@ from sl_nerfstudio.geometry.numerics import geman_mcclure_cost
 
 _COMPARED_ANCHORS = 300  # decoded pixels of each frame that are looked up
 _FRAME_ANCHORS = 1500  # the same of a frame that alone is in question
-_OF_OTHERS = 25  # one in so many of those of the other frames
+_OF_OTHERS = 25  # one in so many of those of the other frames, or in as many as there are frames, if these are more
+_FRAME_LOOK_UPS = 12_000  # of all of them, at most
 _COMPARED_NOISES = 4.0  # residual at which a look-up costs half of what a contradiction costs
 _NATS = _COMPARED_NOISES**2 / 2  # cost of a look-up that contradicts, however far off it is
 _HIDDEN = 2.0  # widths of the kernel from which on a nearer surface is another one, which hides the anchor
@@ -91,7 +92,7 @@ def frame_lead(
     """
     owner, uv = pixels
     chosen = owner == frame
-    chosen[::_OF_OTHERS] = True
+    chosen[:: max(_OF_OTHERS, one.frames)] = True
     generator = torch.Generator().manual_seed(problem.settings.seed)
     gain, block, _ = _gains(problem.maps, (one, two), noise, owner[chosen], uv[chosen], generator, frame)
     mean, error = mean_and_error(gain, block)
@@ -176,7 +177,7 @@ def _common(
         allowed &= frame | frame[:, None]
     first, second = (_numbers(maps, *end, allowed, generator) for end in ends)
     common = first[torch.isin(first, second)]
-    most = EVERY_FRAME_PER_ANCHOR * len(ends[0][1].frame)
+    most = EVERY_FRAME_PER_ANCHOR * len(ends[0][1].frame) if only is None else _FRAME_LOOK_UPS
     chosen = common[torch.randperm(len(common), generator=generator)[:most].sort().values]
     frames = ends[0][0].frames
     return Observations(chosen // frames, chosen % frames)
