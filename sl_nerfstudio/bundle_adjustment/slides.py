@@ -26,7 +26,7 @@ from sl_nerfstudio.parallel import results
 _FIRST_SIGMAS = 4.0  # distance at which a frame is tried first; then twice as far each time
 _PRIOR_SIGMAS = 2.0  # uncertainties of the starting pose up to which it is
 _PARABOLA_SIGMAS = 6.0  # beyond which the parabola no longer holds: contradictions cost no more
-_DECIDED = 2.0  # standard errors by which look-ups speak against both places: none farther off is tried
+_DECIDED = 7.0  # nats that look-ups say against both places: none farther off is tried
 _CELL = 0.75  # of a distance, that a place stands for: half-way to those half as far and twice as far away
 
 
@@ -85,12 +85,11 @@ def how_far(lead: Callable[[float], float], sigma: float, prior: float) -> float
     if not sigma:
         return 0.0
     while distance <= _PRIOR_SIGMAS * prior:
-        leads = lead(distance), lead(-distance)
-        for one in leads:
-            odds = min(one * min(distance / sigma, _PARABOLA_SIGMAS), 0.0) - 0.5 * (distance / prior) ** 2
-            cell = _CELL * distance * exp(odds)
+        said = [min(lead(d) * min(distance / sigma, _PARABOLA_SIGMAS), 0.0) for d in (distance, -distance)]
+        for nats in said:
+            cell = _CELL * distance * exp(nats - 0.5 * (distance / prior) ** 2)
             mass, square = mass + cell, square + cell * distance**2
-        if max(leads) < -_DECIDED:
+        if max(said) < -_DECIDED:
             break
         distance *= 2
     return (square / mass) ** 0.5

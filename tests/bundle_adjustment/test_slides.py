@@ -119,7 +119,7 @@ def test_a_parabola_adds_next_to_nothing_and_a_flat_likelihood_what_starting_pos
 
 
 def test_a_place_that_is_as_likely_again_beyond_unlikely_ones_counts():
-    far = how_far(lambda d: 0.0 if 14 < d < 18 else -1.5, 1.0, 20.0)
+    far = how_far(lambda d: 0.0 if 14 < d < 18 else -1.0, 1.0, 20.0)
     assert 10 < far < 16
     asked: list[float] = []
     how_far(lambda d: asked.append(d) or -2.5, 1.0, 20.0)
