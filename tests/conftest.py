@@ -61,11 +61,14 @@ def earlier_runs_of_this_test_alone(monkeypatch: pytest.MonkeyPatch, tmp_path_fa
 
 
 @pytest.fixture(autouse=True)
-def threads_of_this_test_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def threads_of_this_test_alone() -> Iterator[None]:
     """What opens a run for `ns-export` keeps torch on one thread, and our loops on as many as they had, for good.
 
-    It may be a fixture of a whole file, which comes before this one: so each test begins anew.
+    It may be a fixture of a whole file, which comes before this one: so each test begins anew, and leaves nothing to
+    the fixtures that come before the next.
     """
     from sl_nerfstudio import parallel
 
-    monkeypatch.setattr(parallel, "_ours", None)
+    parallel._ours = None
+    yield
+    parallel._ours = None

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from sl_nerfstudio import parallel
 from tests.dataparser.tiny_scan import TinyScan
 from tests.model.training.small_runs import folder_of, own_signals, settings, train
 from tests.test_ns_commands import _fresh_writers  # noqa: F401 (nerfstudio's log writers are global)
@@ -21,8 +20,7 @@ def scan_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def finished(scan_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run of 12 steps, which nobody interrupted."""
     output = tmp_path_factory.mktemp("finished")
-    with own_signals(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(parallel, "_ours", None)  # as of a test: this may come before what every test begins with
+    with own_signals():
         train(settings(scan_root, output))
     return folder_of(output)
 
