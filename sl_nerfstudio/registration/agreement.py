@@ -9,19 +9,21 @@ c: `p <- c + exp(l) exp(w) (p - c) + v`.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.geometry.devices import pixel_of
-from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.geometry.numerics import geman_mcclure_cost, geman_mcclure_weight
+from sl_nerfstudio.geometry.devices import for_loops, pixel_of
+from sl_nerfstudio.geometry.lie import Similarities, Similarity, moved
+from sl_nerfstudio.geometry.numerics import geman_mcclure_weight
 from sl_nerfstudio.parallel import compiled, compiled_range, compiled_sums
 from sl_nerfstudio.registration.surfaces import SurfaceMap
+from sl_nerfstudio.relative_pose.epipolar import rotated
 
 COARSE_POINTS = 400  # of each frame, wherever many pairs are compared
 AGREEING_SIGMAS = 4.0  # standard deviations of the two surfaces within which a point agrees
@@ -30,14 +32,12 @@ LEAST_FACING_COSINE = 0.3  # between the normals of two places that may be the s
 LEAST_LIT_COSINE = 0.35  # between a normal and its rays to camera and projector: a surface would be seen and lit
 KERNEL_CUTOFF = 4.0  # widths of the robust kernel beyond which a point has no weight
 BEHIND_WEIGHT = 0.5  # of a point a little behind the surface, where a point in front of it counts 1
-PENALTY = 3.0  # of a contradicting point where results are compared: a plane always agrees with a plane
 
 # The compiled loops of `agreement`. Registration spends most of its time here, so each step does one thing for all
 # points, without branches that a processor would have to guess: map, look up, compare, sum up; each step keeps the
 # numbers of the points that are still of interest.
 
 _kernel_weight = compiled(geman_mcclure_weight)
-_kernel_cost = compiled(geman_mcclure_cost)
 
 
 @compiled_range
@@ -45,7 +45,7 @@ def agreement_sums(
     first, last, points, sigma, scale, R, t, reverse, plane, valid, code, camera, c, tolerances, least_facing, cutoff,
     empty, light, least_lit, H, g, counts
 ):  # fmt: skip
-    """Adds to H, g and counts (agreeing, in front, behind, squares, cost, absent); `reverse`: points are the target's.
+    """Adds to H, g and counts (agreeing, in front, behind, absent); `reverse`: points are the target's.
 
     `points` are (6, n): points and normals. For every similarity, they are compared with the other frame's surface.
     """
@@ -60,7 +60,7 @@ def agreement_sums(
         for i in range(3):
             shift[i] = -(M[i, 0] * t[k, 0] + M[i, 1] * t[k, 1] + M[i, 2] * t[k, 2]) / s if reverse else t[k, i]
         _map(points, M, 1 / s if reverse else s, shift, code, camera, h, w, mapped, place)
-        counts[k, 5] += _absent(mapped, place, empty.reshape(h * w), light, least_lit)
+        counts[k, 3] += _absent(mapped, place, empty.reshape(h * w), light, least_lit)
         count = _on_surface(place, flat_valid, some)
         scales = (1.0, s, s) if reverse else (s, 1.0, 1.0)  # of sigma, of the surface's sigma and of distances
         count = _compare(
@@ -117,12 +117,8 @@ def lit(x, y, z, a, b, c, light, least_cosine):
     code, projector, T, reach = light
     if -(a * x + b * y + c * z) < least_cosine * np.sqrt(x * x + y * y + z * z):
         return False
-    X = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-    Y = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-    Z = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-    A = T[0, 0] * a + T[0, 1] * b + T[0, 2] * c
-    B = T[1, 0] * a + T[1, 1] * b + T[1, 2] * c
-    C = T[2, 0] * a + T[2, 1] * b + T[2, 2] * c
+    X, Y, Z = moved(T, x, y, z)
+    A, B, C = rotated(T, a, b, c)
     distance = np.sqrt(X * X + Y * Y + Z * Z)
     if least_cosine * distance > -(A * X + B * Y + C * Z):
         return False
@@ -150,7 +146,7 @@ def _compare(mapped, sigma, place, plane, scales, tolerances, least_facing, cuto
 
     Their normals are put into the first three of `rows`, weights and distances into the last two.
     """
-    used, agreeing, ahead, behind, squares, cost = 0, 0, 0, 0, 0.0, 0.0
+    used, agreeing, ahead, behind = 0, 0, 0, 0
     for m in range(count):
         n = some[m]
         at = int(place[n])
@@ -161,22 +157,16 @@ def _compare(mapped, sigma, place, plane, scales, tolerances, least_facing, cuto
         facing = na * mapped[3, n] + nb * mapped[4, n] + nc * mapped[5, n]
         agrees = (abs(r) < tau) & (facing > least_facing)
         in_front = (r > tau) & ~agrees
-        judged = r > -tolerances[1]
         agreeing += agrees
         ahead += in_front
-        behind += judged & ~agrees & ~in_front
-        squares += (r / spread) ** 2 if agrees else 0.0
-        x = (r / tau) ** 2
-        cost += _kernel_cost(x) if judged else 0.0
+        behind += (r > -tolerances[1]) & ~agrees & ~in_front
         rows[0, used], rows[1, used], rows[2, used] = na, nb, nc
-        rows[7, used], rows[8, used] = _kernel_weight(x) * facing, r
+        rows[7, used], rows[8, used] = _kernel_weight((r / tau) ** 2) * facing, r
         some[used] = n
         used += (facing >= least_facing) & (abs(r) <= cutoff * tau)
     counts[0] += agreeing
     counts[1] += ahead
     counts[2] += behind
-    counts[3] += squares
-    counts[4] += cost
     return used
 
 
@@ -216,53 +206,55 @@ def _add_normal_equations(rows, count, H, g):
 # Several similarities between two frames at once, as arrays.
 
 
+Many = TypeVar("Many", bound="PairSimilarities")
+
+
 @dataclass(frozen=True)
-class Hypotheses:
-    """Similarities `p_target = scale R p_source + t`."""
+class PairSimilarities:
+    """Similarities `p_target = scale R p_source + t`, with what else is known of each."""
 
     scale: Float64[ndarray, "k"]
     R: Float64[ndarray, "k 3 3"]
     t: Float64[ndarray, "k 3"]
-    log_scale_prior: Float64[ndarray, "k"]  # logarithm of the scale that each started with
 
-    @staticmethod
-    def of(*each: Similarity) -> "Hypotheses":
-        """Stack at least one similarity."""
-        scale = np.array([S.scale for S in each])
-        return Hypotheses(scale, np.stack([S.R for S in each]), np.stack([S.t for S in each]), np.log(scale))
-
-    @staticmethod
-    def joined(parts: Sequence["Hypotheses"]) -> "Hypotheses":
+    @classmethod
+    def joined(cls: type[Many], parts: Sequence[Many]) -> Many:
         """Several sets as one."""
-        return Hypotheses(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Hypotheses)))
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def __len__(self) -> int:
         """Number of similarities."""
         return len(self.scale)
 
-    def __getitem__(self, index: list[int]) -> "Hypotheses":
+    def __getitem__(self: Many, index: Sequence[int] | slice | ndarray) -> Many:
         """Select by index."""
-        return Hypotheses(self.scale[index], self.R[index], self.t[index], self.log_scale_prior[index])
-
-    def incremented(
-        self, v: Float64[ndarray, "k 3"], w: Float64[ndarray, "k 3"], growth: Float64[ndarray, "k"],
-        centre: Float64[ndarray, "3"],
-    ) -> "Hypotheses":  # fmt: skip
-        """Each followed by `p <- centre + growth exp(w) (p - centre) + v`."""
-        turn = Rotation.from_rotvec(w).as_matrix()
-        t = centre + growth[:, None] * np.einsum("kij,kj->ki", turn, self.t - centre) + v
-        return Hypotheses(self.scale * growth, turn @ self.R, t, self.log_scale_prior)
+        return type(self)(*(getattr(self, f.name)[index] for f in fields(self)))
 
     def similarity(self, k: int) -> Similarity:
         """One of them."""
         return Similarity(float(self.scale[k]), self.R[k], self.t[k])
 
-    def difference(self, a: int, b: int, centre: Float64[ndarray, "3"]) -> tuple[float, float]:
-        """Angle between two of them, in degrees, and how far apart they map the point that b maps to `centre`."""
-        angle = np.arccos(np.clip((np.trace(self.R[a] @ self.R[b].T) - 1) / 2, -1, 1))
-        p = (self.R[b].T @ (centre - self.t[b])) / self.scale[b]
-        shift = np.linalg.norm(self.scale[a] * self.R[a] @ p + self.t[a] - centre)
-        return float(np.degrees(angle)), float(shift)
+    def incremented(
+        self: Many, v: Float64[ndarray, "k 3"], w: Float64[ndarray, "k 3"], growth: Float64[ndarray, "k"],
+        centre: Float64[ndarray, "3"],
+    ) -> Many:  # fmt: skip
+        """Each followed by `p <- centre + growth exp(w) (p - centre) + v`."""
+        turn = Rotation.from_rotvec(w).as_matrix()
+        t = centre + growth[:, None] * np.einsum("kij,kj->ki", turn, self.t - centre) + v
+        return replace(self, scale=self.scale * growth, R=turn @ self.R, t=t)
+
+
+@dataclass(frozen=True)
+class Hypotheses(PairSimilarities):
+    """Similarities of a search."""
+
+    log_scale_prior: Float64[ndarray, "k"]  # logarithm of the scale that each started with
+
+    @staticmethod
+    def of(*each: Similarity) -> "Hypotheses":
+        """Stack at least one similarity."""
+        stacked = Similarities.of(each)
+        return Hypotheses(stacked.scale, stacked.R, stacked.t, np.log(stacked.scale))
 
 
 @dataclass(frozen=True)
@@ -284,11 +276,6 @@ class Side:
         """Draw about `count` points spread evenly over the image."""
         return Side(surface, *surface.sample(count, rng))
 
-    def thinned(self, most: int) -> "Side":
-        """Keep every n-th point, about `most` at most."""
-        some = slice(None, None, max(1, len(self.points) // most))
-        return Side(self.map, *(np.ascontiguousarray(part[some]) for part in (self.points, self.normals, self.sigma)))
-
 
 @dataclass(frozen=True)
 class Tolerance:
@@ -296,9 +283,6 @@ class Tolerance:
 
     radii: float  # of the target's points
     sigmas: float
-
-
-AGREES = Tolerance(0.0, AGREEING_SIGMAS)
 
 
 @dataclass(frozen=True)
@@ -310,33 +294,12 @@ class Agreement:
     agreeing: Float64[ndarray, "k"]  # fraction of the points that lie on the other surface
     in_front: Float64[ndarray, "k"]  # fraction that would hide what the other camera saw
     behind: Float64[ndarray, "k"]  # fraction a little behind what the other camera saw
-    squares: Float64[ndarray, "k"]  # mean squared distance of those that agree, in units of its variance
     absent: Float64[ndarray, "k"]  # fraction that would be seen and lit where the other camera saw nothing
-    cost: Float64[ndarray, "k"]  # mean robust cost of the points that could be judged: 0 exact, 1 far beyond the kernel
 
     @property
-    def fitness(self) -> Float64[ndarray, "k"]:
-        """Fraction that agrees, of the points that could be judged, or should be seen and are not."""
-        return self.agreeing / self.expected.clip(1e-9)
-
-    @property
-    def judged(self) -> Float64[ndarray, "k"]:
-        """Fraction of the points that could be judged: the other camera saw a surface where they lie."""
-        return self.agreeing + self.in_front + self.behind
-
-    @property
-    def expected(self) -> Float64[ndarray, "k"]:
-        """Fraction of the points that the other camera should have seen: what could be judged, and absent ones."""
-        return self.judged + self.absent
-
-    @property
-    def contradicting(self) -> Float64[ndarray, "k"]:
-        """Fraction that contradicts; a point a little behind the surface counts BEHIND_WEIGHT."""
-        return self.in_front + self.absent + BEHIND_WEIGHT * self.behind
-
-    def score(self, penalty: float = 1.0) -> Float64[ndarray, "k"]:
-        """Points that agree less `penalty` times those that contradict."""
-        return self.agreeing - penalty * self.contradicting
+    def score(self) -> Float64[ndarray, "k"]:
+        """Points that agree less those that contradict; a point a little behind the surface counts BEHIND_WEIGHT."""
+        return self.agreeing - (self.in_front + self.absent + BEHIND_WEIGHT * self.behind)
 
 
 def agreement(source: Side, target: Side, hypotheses: Hypotheses, tolerance: Tolerance) -> Agreement:
@@ -345,25 +308,15 @@ def agreement(source: Side, target: Side, hypotheses: Hypotheses, tolerance: Tol
     `tolerance` is the distance within which points agree, and the width of the robust kernel.
     """
     k, radius = len(hypotheses), target.map.radius
-    H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 6))
+    H, g, counts = np.zeros((k, 7, 7)), np.zeros((k, 7)), np.zeros((2, k, 4))
     tolerances = np.array([tolerance.radii * radius, HIDDEN_DEPTH * radius, tolerance.sigmas])
     scale, R, t = hypotheses.scale, np.ascontiguousarray(hypotheses.R), np.ascontiguousarray(hypotheses.t)
     for reverse, (mover, seen) in enumerate(((source, target), (target, source))):
         m = seen.map
         agreement_sums(
-            len(scale), mover.rows, mover.sigma, scale, R, t, bool(reverse), m.plane, m.valid, m.model_code,
-            m.parameters, target.map.centroid, tolerances, LEAST_FACING_COSINE, KERNEL_CUTOFF,
+            len(scale), mover.rows, mover.sigma, scale, R, t, bool(reverse), m.plane, m.valid,
+            *for_loops(m.camera), target.map.centroid, tolerances, LEAST_FACING_COSINE, KERNEL_CUTOFF,
             m.nothing.empty, m.nothing.light, LEAST_LIT_COSINE, H, g, counts[reverse],
         )  # fmt: skip
     shares = (counts[0] / max(len(source.points), 1) + counts[1] / max(len(target.points), 1)) / 2
-    squares = counts[..., 3].sum(0) / np.maximum(counts[..., 0].sum(0), 1)
-    cost = counts[..., 4].sum(0) / np.maximum(counts[..., :3].sum((0, 2)), 1)
-    return Agreement(H, g, shares[:, 0], shares[:, 1], shares[:, 2], squares, shares[:, 5], cost)
-
-
-def agreement_at(
-    maps: tuple[SurfaceMap, SurfaceMap], S_target_source: Similarity, rng: np.random.Generator, tolerance: Tolerance
-) -> Agreement:
-    """Compare two frames under one similarity."""
-    source, target = (Side.sampled(m, COARSE_POINTS, rng) for m in maps)
-    return agreement(source, target, Hypotheses.of(S_target_source), tolerance)
+    return Agreement(H, g, *shares.T)

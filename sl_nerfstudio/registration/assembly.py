@@ -16,13 +16,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.registration.evidence import MOST_OF_A_PAIR, Comparison, ScanEvidence
-from sl_nerfstudio.registration.pairs import (
-    LEAST_ODDS,
-    SAME_PLACE_DEG,
-    SAME_PLACE_SHIFT,
-    TONE_ODDS,
-    PairMatch,
-)
+from sl_nerfstudio.registration.pairs import LEAST_ODDS, SAME_PLACE_DEG, SAME_PLACE_SHIFT, TONE_ODDS, PairMatch
 from sl_nerfstudio.registration.pose_graph import Component, Pivots, optimise_at_places
 
 MOST_COMPARED = 12  # clearly different similarities between two components
@@ -32,14 +26,6 @@ ADJUSTED_DEG = 6.0  # between two places, up to which the joint adjustment leads
 BASELINE_SIGMA = 0.5  # of the logarithm of a ratio of baselines: nobody moves two devices much farther apart
 LARGEST_BASELINE = 5.0  # such a ratio, beyond which a surface has collapsed onto a patch of another
 LEAST_SIGHT_COSINE = float(np.cos(np.radians(75.0)))  # between lines of sight: beyond it frames share no surface
-
-
-@dataclass(frozen=True)
-class Link:
-    """A similarity between two components that a pair across says."""
-
-    S_first_second: Similarity
-    log_odds: float  # of the pair's place against nothing
 
 
 @dataclass(frozen=True)
@@ -105,13 +91,9 @@ class Assembly:
             a, b = self._number[edge.target], self._number[edge.source]
             if a == b:
                 continue
-            first, second, key = (
-                self._component_of(edge.target),
-                self._component_of(edge.source),
-                (min(a, b), max(a, b)),
-            )
-            if a > b:
-                first, second = second, first
+            key = min(a, b), max(a, b)
+            ends = (edge.target, edge.source) if a < b else (edge.source, edge.target)
+            first, second = (next(c for c in self.components if frame in c) for frame in ends)
             if key not in self._decisions:
                 self._decisions[key] = self._decision(first, second)
             decision = self._decisions[key]
@@ -122,9 +104,6 @@ class Assembly:
             if best is None or decision.lead > best[0]:
                 best = decision.lead, first, second, decision.S_first_second
         return None if best is None else best[1:]
-
-    def _component_of(self, frame: int) -> Component:
-        return next(c for c in self.components if frame in c)
 
     def _joined(self, first: Component, second: Component, S: Similarity) -> Component:
         """Merge both in the world of the first, with all pairs inside optimised together."""
@@ -204,15 +183,15 @@ class Assembly:
 
     def _proposed(self, first: Component, second: Component) -> list[Similarity]:
         """The clearly different similarities between two components that pairs across say, the most likely first."""
-        links = [link for e in self._between(first, second) for link in self._links(e, first, second)]
+        said = [place for e in self._between(first, second) for place in self._said(e, first, second)]
         ratio = log_baseline(second) - log_baseline(first)
-        links = [link for link in links if abs(np.log(link.S_first_second.scale) + ratio) < np.log(LARGEST_BASELINE)]
+        said = [(odds, S) for odds, S in said if abs(np.log(S.scale) + ratio) < np.log(LARGEST_BASELINE)]
         distinct: list[Similarity] = []
-        for link in sorted(links, key=lambda one: -one.log_odds):
+        for _, S in sorted(said, key=lambda one: -one[0]):
             if len(distinct) == MOST_COMPARED:
                 break
-            if all(self._differ(link.S_first_second, other, second) for other in distinct):
-                distinct.append(link.S_first_second)
+            if all(self._differ(S, other, second) for other in distinct):
+                distinct.append(S)
         return distinct
 
     def settled(self, first: Component, second: Component, S_first_second: Similarity) -> Component:
@@ -353,14 +332,12 @@ class Assembly:
         ]
 
     @staticmethod
-    def _links(e: PairMatch, first: Component, second: Component) -> list[Link]:
-        """What a pair across says: its best similarity and its rivals."""
+    def _said(e: PairMatch, first: Component, second: Component) -> list[tuple[float, Similarity]]:
+        """Similarities between two components that a pair across says, each with its log-odds against nothing."""
         forward = e.source in second
-        target, source = (e.target, e.source) if forward else (e.source, e.target)
-        places = [(one.S_target_source, e.log_odds + one.log_odds) for one in e.places]
-        return [
-            Link(first[target] @ (S if forward else S.inverse()) @ second[source].inverse(), odds) for S, odds in places
-        ]
+        i, j = (e.target, e.source) if forward else (e.source, e.target)
+        places = [(e.log_odds + one.log_odds, one.S_target_source) for one in e.places]
+        return [(odds, first[i] @ (S if forward else S.inverse()) @ second[j].inverse()) for odds, S in places]
 
     def _differ(self, a: Similarity, b: Similarity, second: Component) -> bool:
         """Whether two similarities put the frames of `second` at clearly different places."""

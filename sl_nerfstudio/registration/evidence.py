@@ -18,20 +18,28 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int8, Int64
 from numpy import ndarray
 from scipy.ndimage import uniform_filter
-from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of
-from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.geometry.lie import Similarities, Similarity, row_times_rotation
 from sl_nerfstudio.parallel import both, compiled, compiled_range
-from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, HIDDEN_DEPTH, LEAST_LIT_COSINE, Hypotheses, lit
+from sl_nerfstudio.registration.agreement import (
+    AGREEING_SIGMAS,
+    HIDDEN_DEPTH,
+    LEAST_LIT_COSINE,
+    Hypotheses,
+    PairSimilarities,
+    lit,
+)
 from sl_nerfstudio.registration.surfaces import (
     EmptyPlaces,
     FrameCloud,
+    Lattice,
     SurfaceMap,
     build_surface_map,
+    centre_and_radius,
     find_empty_places,
 )
-from sl_nerfstudio.relative_pose.epipolar import directions
+from sl_nerfstudio.relative_pose.epipolar import cross, rotated
 
 LARGEST_SIDE = 640  # places of the lattice along the image's longer side
 POINTS = 2000  # of a frame that are compared, about
@@ -60,10 +68,8 @@ INDISTINCT_SIGMAS = 3.0  # within which residuals say nothing of the place: view
 ELSEWHERE_SIGMA = 12.0  # of a point that does not belong there: somewhere near, or anywhere
 
 USUAL_SHARE = 0.9  # of other places at which a point fits, before any was tried: most surface is smooth
-ABSENT_SHARE, LEAST_ABSENT = (
-    1e-3,
-    0.01,
-)  # points that should be seen and are not: in the right place, elsewhere at least
+# Points that should be seen and are not: in the right place, and elsewhere at least.
+ABSENT_SHARE, LEAST_ABSENT = 1e-3, 0.01
 
 LEAST_SEEN = 0.3  # points that a place must let be judged, relative to the place that lets most
 LEAST_AGREEING = 0.7  # of those that it lets be judged, for a place to be such a measure
@@ -94,7 +100,6 @@ class FrameEvidence:
     smooth: Float32[ndarray, "a b 8"]  # pose errors of the distance and the normal (NaN: unknown), of blocks of places
     nothing: EmptyPlaces
     points: Float64[ndarray, "n 12"]  # position, normal, sigma along the ray, pose errors
-    place: Int64[ndarray, "n"]  # of each point in the lattice
     centroid: Float64[ndarray, "3"]
     radius: float
     area: float  # points that count as one
@@ -122,21 +127,12 @@ class Frame:
 
 def frame_evidence(cloud: FrameCloud) -> FrameEvidence:
     """Put the points of a cloud on the lattice."""
-    factor = min(1.0, LARGEST_SIDE / max(cloud.camera.w, cloud.camera.h))
-    camera = cloud.camera.scaled(factor)
+    lattice = Lattice.of(cloud.camera, cloud.uv_camera, LARGEST_SIDE)
+    camera, mean, known = lattice.camera, lattice.mean, lattice.count > 0
     h, w = camera.h, camera.w
-    column, row = np.floor(cloud.uv_camera * factor).astype(np.int64).T
-    index = np.minimum(row, h - 1) * w + np.minimum(column, w - 1)
-    count = np.maximum(np.bincount(index, minlength=h * w), 1)
-
-    def mean(values: Float64[ndarray, "n"]) -> Float64[ndarray, "h w"]:
-        return (np.bincount(index, values, h * w) / count).reshape(h, w)
-
-    known = np.bincount(index, minlength=h * w).reshape(h, w) > 0
     inverse = mean(1 / np.linalg.norm(cloud.points, axis=1))
     distance = np.where(known, 1 / np.where(known, inverse, 1.0), np.nan)
-    uv = np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1).reshape(-1, 2)
-    ray = directions(camera, uv).reshape(h, w, 3)
+    ray = lattice.rays()
     ray = ray / np.linalg.norm(ray, axis=-1, keepdims=True)
     point = ray * distance[..., None]
     noise = mean(cloud.sigma_noise)
@@ -152,12 +148,10 @@ def frame_evidence(cloud: FrameCloud) -> FrameEvidence:
     some[step // 2 :: step, step // 2 :: step] = True
     place = np.flatnonzero(usable & some)
     points = np.concatenate([point, normal, sigma[..., None], errors], -1).reshape(h * w, -1)[place]
-    visible = point[usable] if usable.any() else cloud.points
-    centroid = visible.mean(0)
-    radius = float(np.sqrt(((visible - centroid) ** 2).sum(-1).mean()))
+    centroid, radius = centre_and_radius(point[usable] if usable.any() else cloud.points)
     return FrameEvidence(
         camera, np.ascontiguousarray(surface), _in_blocks(errors, normal, known), find_empty_places(cloud, camera),
-        np.ascontiguousarray(points), place, centroid, radius,
+        np.ascontiguousarray(points), centroid, radius,
         max(CORRELATION_AREA * (max(w, h) / LARGEST_SIDE) ** 2 / step**2, len(place) / INDEPENDENT, 1.0),
         float(np.median(sigma[usable])) if usable.any() else 1.0,
         float(np.linalg.norm(cloud.pose_errors.mean(0))),
@@ -234,9 +228,7 @@ def _residuals(
     M, shift, J = np.empty((3, 3)), np.empty(3), np.empty(17)
     for k in range(first, last):
         s = scale[k]
-        for i in range(3):
-            for j in range(3):
-                M[i, j] = R[k, j, i] if reverse else R[k, i, j]
+        M[:] = R[k].T if reverse else R[k]
         for i in range(3):
             shift[i] = -(M[i, 0] * t[k, 0] + M[i, 1] * t[k, 1] + M[i, 2] * t[k, 2]) / s if reverse else t[k, i]
         f = 1 / s if reverse else s
@@ -252,17 +244,13 @@ def _residuals(
                 off += points[m, 7 + e] * own[k, e]
             grown = 1 + off / length
             px, py, pz = px * grown, py * grown, pz * grown
-            X = f * (M[0, 0] * px + M[0, 1] * py + M[0, 2] * pz) + shift[0]
-            Y = f * (M[1, 0] * px + M[1, 1] * py + M[1, 2] * pz) + shift[1]
-            Z = f * (M[2, 0] * px + M[2, 1] * py + M[2, 2] * pz) + shift[2]
+            turned_x, turned_y, turned_z = rotated(M, px, py, pz)
+            X, Y, Z = f * turned_x + shift[0], f * turned_y + shift[1], f * turned_z + shift[2]
             column, row, front = pixel_of(code, X, Y, Z, camera)
             u, v = column - 0.5, row - 0.5
             if not (front and u >= 0 and v >= 0 and u < w - 1 and v < h - 1):
                 continue
-            a, b, c = points[m, 3], points[m, 4], points[m, 5]
-            A = M[0, 0] * a + M[0, 1] * b + M[0, 2] * c
-            B = M[1, 0] * a + M[1, 1] * b + M[1, 2] * c
-            C = M[2, 0] * a + M[2, 1] * b + M[2, 2] * c
+            A, B, C = rotated(M, points[m, 3], points[m, 4], points[m, 5])
             d = np.sqrt(X * X + Y * Y + Z * Z)
             if least_facing * d > -(A * X + B * Y + C * Z):
                 continue
@@ -292,28 +280,17 @@ def _residuals(
                 cosine = -(A * X + B * Y + C * Z) / d
             # the residual's derivative by the mapped point: along the normal, over its cosine with the ray
             ga, gb, gc = -na / cosine, -nb / cosine, -nc / cosine
-            ea = (
-                (
-                    ga * (M[0, 0] * px + M[0, 1] * py + M[0, 2] * pz)
-                    + gb * (M[1, 0] * px + M[1, 1] * py + M[1, 2] * pz)
-                    + gc * (M[2, 0] * px + M[2, 1] * py + M[2, 2] * pz)
-                )
-                * f
-                / (length * grown)
-            )  # by a motion along the point's own ray
+            # and by a motion along the point's own ray
+            ea = (ga * turned_x + gb * turned_y + gc * turned_z) * f / (length * grown)
             twist = 0.5 * (d00 + d11 - d01 - d10)
             sigma = np.sqrt(float(surface[nv, nu, 1]) ** 2 + (ea * points[m, 6]) ** 2 + twist * twist)
             codes[k, m] = JUDGED
             r = rho / sigma
-            if (
-                width <= 0
-                and r > CONTRADICTING_SIGMAS
-                and _behind_edge(
-                    X, Y, Z, rho, shift, surface, code, camera, max(d00, d01, d10, d11) - min(d00, d01, d10, d11)
-                )
-            ):
-                codes[k, m] = HIDDEN
-                continue
+            if width <= 0 and r > CONTRADICTING_SIGMAS:
+                jump = max(d00, d01, d10, d11) - min(d00, d01, d10, d11)
+                if _behind_edge(X, Y, Z, shift, surface, code, camera, jump):
+                    codes[k, m] = HIDDEN
+                    continue
             z[k, m] = r
             spread[k, m] = sigma / usual
             if width <= 0 or abs(r) > 4 * width:
@@ -321,17 +298,15 @@ def _residuals(
             x = r / width
             weight = 1 / (1 + x * x) ** 2
             if reverse:  # the point stays, the increment moves the other frame below it
-                Ga = -(M[0, 0] * ga + M[1, 0] * gb + M[2, 0] * gc) / s
-                Gb = -(M[0, 1] * ga + M[1, 1] * gb + M[2, 1] * gc) / s
-                Gc = -(M[0, 2] * ga + M[1, 2] * gb + M[2, 2] * gc) / s
+                Ga, Gb, Gc = row_times_rotation(ga, gb, gc, M)
+                Ga, Gb, Gc = -Ga / s, -Gb / s, -Gc / s
                 qx, qy, qz = px - centre[0], py - centre[1], pz - centre[2]
             else:
                 Ga, Gb, Gc = ga, gb, gc
                 qx, qy, qz = X - centre[0], Y - centre[1], Z - centre[2]
             J[0], J[1], J[2] = Ga / sigma, Gb / sigma, Gc / sigma
-            J[3] = (qy * Gc - qz * Gb) / sigma
-            J[4] = (qz * Ga - qx * Gc) / sigma
-            J[5] = (qx * Gb - qy * Ga) / sigma
+            turn_x, turn_y, turn_z = cross(qx, qy, qz, Ga, Gb, Gc)
+            J[3], J[4], J[5] = turn_x / sigma, turn_y / sigma, turn_z / sigma
             J[6] = (qx * Ga + qy * Gb + qz * Gc) / sigma
             for e in range(5):
                 moved, below = ea * points[m, 7 + e] / sigma, -smooth[br, bc, e] / sigma
@@ -345,7 +320,7 @@ def _residuals(
 
 
 @compiled
-def _behind_edge(X, Y, Z, rho, eye, surface, code, camera, jump):
+def _behind_edge(X, Y, Z, eye, surface, code, camera, jump):
     """Whether a point that lies behind the surface is hidden by an edge of it, and seen past that edge from `eye`.
 
     On the way towards the other camera the point comes out from behind the surface: through it, or where its distance
@@ -381,41 +356,20 @@ def _behind_edge(X, Y, Z, rho, eye, surface, code, camera, jump):
 
 
 @dataclass(frozen=True)
-class Places:
-    """Similarities `p_target = scale R p_source + t` with the errors of both relative poses, in their sigmas."""
+class Places(PairSimilarities):
+    """Similarities with the errors of both relative poses, in their sigmas."""
 
-    scale: Float64[ndarray, "k"]
-    R: Float64[ndarray, "k 3 3"]
-    t: Float64[ndarray, "k 3"]
     errors: Float64[ndarray, "k 10"]  # of the source, of the target
 
     @staticmethod
     def of(*each: Similarity) -> "Places":
         """Stack similarities; no errors."""
-        return Places(
-            np.array([S.scale for S in each]), np.stack([S.R for S in each]), np.stack([S.t for S in each]),
-            np.zeros((len(each), 2 * POSE_ERRORS)),
-        )  # fmt: skip
+        return Places.without_errors(Similarities.of(each))
 
     @staticmethod
-    def of_hypotheses(found: Hypotheses) -> "Places":
-        """The ends of a search; no errors."""
-        return Places(found.scale, found.R, found.t, np.zeros((len(found), 2 * POSE_ERRORS)))
-
-    @staticmethod
-    def joined(parts: Sequence["Places"]) -> "Places":
-        """Several sets as one."""
-        return Places(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("scale", "R", "t", "errors")))
-
-    def __len__(self) -> int:
-        return len(self.scale)
-
-    def __getitem__(self, index: Sequence[int] | slice | ndarray) -> "Places":
-        return Places(self.scale[index], self.R[index], self.t[index], self.errors[index])
-
-    def similarity(self, k: int) -> Similarity:
-        """One of them."""
-        return Similarity(float(self.scale[k]), self.R[k], self.t[k])
+    def without_errors(found: Hypotheses | Similarities) -> "Places":
+        """Similarities, such as the ends of a search, with no errors."""
+        return Places(found.scale, found.R, found.t, np.zeros((len(found.scale), 2 * POSE_ERRORS)))
 
 
 @dataclass(frozen=True)
@@ -455,10 +409,6 @@ class Compared:
         if len(size) < FEWEST_JUDGED:
             return 1.0
         return float(np.clip((np.quantile(size, NOISE_QUANTILES) / NOISE_RESIDUALS).max(), 1.0, LARGEST_NOISE))
-
-    def scaled(self, noise: Float64[ndarray, "n"]) -> "Compared":
-        """Residuals in units of what they are found to be."""
-        return replace(self, z=self.z / noise.astype(np.float32))
 
     def overlaps(self, other: "Compared", share: float) -> bool:
         """Whether the first place lets at least a share of the points be judged that the other's does."""
@@ -641,10 +591,8 @@ class PairEvidence:
                 A[:, 3:6, 3:6] += held * trace[:, None, None]
             step = -np.linalg.solve(A, g[..., None])[..., 0]
             step[:, :7] /= np.maximum(np.linalg.norm(step[:, :7], axis=1, keepdims=True) / 0.3, 1)
-            E = Rotation.from_rotvec(step[:, 3:6]).as_matrix()
-            growth = np.exp(step[:, 6])
-            t = c + growth[:, None] * np.einsum("kij,kj->ki", E, places.t - c) + step[:, :3] * radius
-            places = Places(places.scale * growth, E @ places.R, t, places.errors + step[:, 7:])
+            moved = places.incremented(step[:, :3] * radius, step[:, 3:6], np.exp(step[:, 6]), c)
+            places = replace(moved, errors=places.errors + step[:, 7:])
         return places, H
 
     def commonness(self, found: Compared) -> tuple[Commonness, Commonness]:
@@ -702,7 +650,7 @@ class PairEvidence:
     def scaled(self, found: Compared, noise: tuple[float, float]) -> Compared:
         """Residuals in units of what they are found to be."""
         each = [np.full(len(points), size) for points, size in zip(self._points, noise, strict=True)]
-        return replace(found.scaled(np.concatenate(each)), indistinct=INDISTINCT_SIGMAS)
+        return replace(found, z=found.z / np.concatenate(each).astype(np.float32), indistinct=INDISTINCT_SIGMAS)
 
     def by_likelihood(self, found: Compared) -> Float64[ndarray, "k"]:
         """By how many nats each place leads the others, at worst; of places that see enough of each other's surface."""

@@ -18,7 +18,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from scipy.special import softmax
 
-from sl_nerfstudio.geometry.devices import pixel_of
+from sl_nerfstudio.geometry.devices import for_loops, pixel_of
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from sl_nerfstudio.parallel import compiled_range
 from sl_nerfstudio.registration.agreement import (
@@ -43,6 +43,7 @@ from sl_nerfstudio.registration.evidence import (
     Places,
 )
 from sl_nerfstudio.registration.surfaces import SurfaceMap
+from sl_nerfstudio.relative_pose.epipolar import rotated
 
 Sides = tuple[Side, Side]  # of the source and the target
 
@@ -102,9 +103,8 @@ MOST_BEHIND = 60.0  # nats behind the best from which a place is no rival
 LEAST_SLIP_DEG = 4.0  # up to which the places along a slip are one
 LEAST_SIDE_DEG = 12.0  # between two sides of an object, or teeth of a gear; closer places are slides along a surface
 LEAST_INFORMATION = 1e-3  # on each unknown, inverse squares of radians and radii
-ERROR_FACTOR = (
-    2.0  # on the sigma by the likelihood's curvature: the decoder's errors are shared over more than a window
-)
+# On the sigma by the likelihood's curvature: the decoder's errors are shared over more than a window.
+ERROR_FACTOR = 2.0
 LEAST_SIGMA_DEG, LEAST_SIGMA_SHIFT = 0.1, 0.002  # of rotations, and of shifts in radii: surfaces are bent a little
 MOST_RIVALS = 24
 LEAST_WEIGHT = 0.02  # of an edge with many rivals
@@ -262,7 +262,7 @@ def register_pair(
     if not all(len(frame.evidence.points) and frame.map.valid.any() for frame in frames):
         return None
     found = search_places((source.map, target.map), search, rng, guess)
-    starts = Places.joined([Places.of_hypotheses(found), *([Places.of(*known)] if known else [])])
+    starts = Places.joined([Places.without_errors(found), *([Places.of(*known)] if known else [])])
     few = PairEvidence(source.evidence, target.evidence, THINNED)
     places, H = few.refined(starts, SEARCH_WIDTHS)
     odds = few.by_likelihood(few.compare(places))
@@ -296,17 +296,16 @@ def search_score(maps: tuple[SurfaceMap, SurfaceMap], search: Search, rng: np.ra
     source, target = maps
     if not (source.valid.any() and target.valid.any()):
         return -1.0
-    sides = tuple(Side.sampled(m, LIKENESS_POINTS, rng) for m in maps)
+    sides = Side.sampled(source, LIKENESS_POINTS, rng), Side.sampled(target, LIKENESS_POINTS, rng)
     found = without_guess(source, target, search)
     tolerance = Tolerance(SEARCH_TOLERANCE, AGREEING_SIGMAS)
-    return float(agreement(sides[0], sides[1], found, tolerance).score().max())
+    return float(agreement(*sides, found, tolerance).score.max())
 
 
 def _ranked(sides: Sides, found: Hypotheses, radii: float) -> list[int]:
     """Their indices, the highest score first; points within some radii agree."""
     tolerance = Tolerance(radii, AGREEING_SIGMAS)
-    score = agreement(*sides, found, tolerance).score()
-    return np.argsort(-score, kind="stable").tolist()
+    return np.argsort(-agreement(*sides, found, tolerance).score, kind="stable").tolist()
 
 
 def _distinct(found: Hypotheses, ranked: list[int], count: int, target: SurfaceMap) -> list[int]:
@@ -321,8 +320,12 @@ def _distinct(found: Hypotheses, ranked: list[int], count: int, target: SurfaceM
 
 
 def _differ(found: Hypotheses, a: int, b: int, target: SurfaceMap) -> bool:
-    angle_deg, shift = found.difference(a, b, target.centroid)
-    return angle_deg > SAME_ROTATION_DEG or shift / target.radius > SAME_SHIFT
+    """By the angle between two of them, or by how far apart they map the point that b maps to the centroid."""
+    centre = target.centroid
+    angle = np.arccos(np.clip((np.trace(found.R[a] @ found.R[b].T) - 1) / 2, -1, 1))
+    p = (found.R[b].T @ (centre - found.t[b])) / found.scale[b]
+    shift = np.linalg.norm(found.scale[a] * found.R[a] @ p + found.t[a] - centre)
+    return bool(np.degrees(angle) > SAME_ROTATION_DEG or shift / target.radius > SAME_SHIFT)
 
 
 def _improved(sides: Sides, found: Hypotheses, kernel: Tolerance) -> Hypotheses:
@@ -656,7 +659,7 @@ def likeness(sides: Sides, ways: Hypotheses, common: Tolerance) -> Float64[ndarr
     scale, R, t = ways.scale, np.ascontiguousarray(ways.R), np.ascontiguousarray(ways.t)
     _sums(
         len(scale), points[thin], normals[thin], sigma[thin], tone[thin], scale, R, t,
-        target.point, target.normal, target.sigma, target.valid, target.tone, target.model_code, target.parameters,
+        target.point, target.normal, target.sigma, target.valid, target.tone, *for_loops(target.camera),
         common.sigmas, LEAST_FACING_COSINE, sums,
     )  # fmt: skip
     n, a, b, aa, bb, ab = sums.T
@@ -672,14 +675,13 @@ def likeness(sides: Sides, ways: Hypotheses, common: Tolerance) -> Float64[ndarr
 def _around(sides: Sides, S: Similarity, direction: Float64[ndarray, "7"], common: Tolerance) -> Hypotheses:
     """Similarities along the motion, a step apart, once around; all but the rotation follows the surfaces."""
     target = sides[1].map
-    few = sides[0].thinned(TONE_FOLLOWED_POINTS), sides[1].thinned(TONE_FOLLOWED_POINTS)
     ways: list[list[Hypotheses]] = []
     for sense in (-1.0, 1.0):
         step, way = screw_motion(sense * np.radians(TONE_STEP_DEG) * direction, target), [Hypotheses.of(S)]
         for _ in range(round(180 / TONE_STEP_DEG)):
             at = Hypotheses.of(step @ way[-1].similarity(0))
             for _ in range(TONE_FOLLOW_STEPS):
-                at = followed(few, at, direction[3:6], common)
+                at = followed(sides, at, direction[3:6], common)
             if not abs(np.log(at.scale[0] / S.scale)) < LARGEST_LOG_SCALE:
                 break  # nothing is left that it could follow
             way.append(at)
@@ -735,13 +737,10 @@ def _sums(
     """Adds the number, sums and products of tones that meet, for each similarity."""
     h, w = valid.shape
     for k in range(first, last):
-        s = scale[k]
+        s, M = scale[k], R[k]
         for n in range(len(points)):
-            x, y, z = points[n, 0], points[n, 1], points[n, 2]
-            a, b, c = normals[n, 0], normals[n, 1], normals[n, 2]
-            X = s * (R[k, 0, 0] * x + R[k, 0, 1] * y + R[k, 0, 2] * z) + t[k, 0]
-            Y = s * (R[k, 1, 0] * x + R[k, 1, 1] * y + R[k, 1, 2] * z) + t[k, 1]
-            Z = s * (R[k, 2, 0] * x + R[k, 2, 1] * y + R[k, 2, 2] * z) + t[k, 2]
+            x, y, z = rotated(M, points[n, 0], points[n, 1], points[n, 2])
+            X, Y, Z = s * x + t[k, 0], s * y + t[k, 1], s * z + t[k, 2]
             column, row, in_front = pixel_of(code, X, Y, Z, camera)
             if not (in_front and column >= 0 and row >= 0 and column < w and row < h):
                 continue
@@ -749,9 +748,7 @@ def _sums(
             if not valid[i, j] or not np.isfinite(map_tone[i, j]):
                 continue
             na, nb, nc = map_normal[i, j, 0], map_normal[i, j, 1], map_normal[i, j, 2]
-            A = R[k, 0, 0] * a + R[k, 0, 1] * b + R[k, 0, 2] * c
-            B = R[k, 1, 0] * a + R[k, 1, 1] * b + R[k, 1, 2] * c
-            C = R[k, 2, 0] * a + R[k, 2, 1] * b + R[k, 2, 2] * c
+            A, B, C = rotated(M, normals[n, 0], normals[n, 1], normals[n, 2])
             off = na * (X - map_point[i, j, 0]) + nb * (Y - map_point[i, j, 1]) + nc * (Z - map_point[i, j, 2])
             if na * A + nb * B + nc * C < least_facing or abs(off) > sigmas * np.hypot(s * sigma[n], map_sigma[i, j]):
                 continue

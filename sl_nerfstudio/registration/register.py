@@ -16,7 +16,6 @@ from numpy import ndarray
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, angle_deg
 from sl_nerfstudio.parallel import one_library_thread, results, tracked
-from sl_nerfstudio.registration.agreement import PENALTY
 from sl_nerfstudio.registration.assembly import facing, relative
 from sl_nerfstudio.registration.evidence import Frame, ScanEvidence
 from sl_nerfstudio.registration.pairs import (
@@ -57,6 +56,7 @@ FACING = 8  # frames with which each is compared at last
 LARGEST_SIGMA_ROTATION_DEG = 3.0  # standard deviation of the least known rotation beyond which it is uncertain
 UNKNOWN_SIGMA_ROTATION_DEG = 104.0  # the same where the rotation is unobservable: of all angles from -180 to 180
 REACH = 2  # frames before and after one with which each pose of its projector is compared
+PENALTY = 3.0  # of a contradicting point, where an agreeing one counts 1: a plane always agrees with a plane
 RIVAL = 0.8  # support of another pose, relative to the best, from which the choice is not certain
 
 
@@ -198,15 +198,13 @@ def _in_first_camera(
     n = len(registered)
     poses, baseline = np.full((n, 4, 4), np.nan), np.full(n, np.nan)
     frames: list[int] = np.flatnonzero(registered).tolist()
-    if not frames:
-        return poses, baseline
     world = [nodes[k] for k in frames]
+    if not world:
+        return poses, baseline
     unit = float(np.exp(np.mean([np.log(S.scale) for S in world])))
     gauge = Similarity.scaling(1 / unit) @ Similarity(1.0, world[0].R, world[0].t).inverse()
     for k, S in zip(frames, (gauge @ S for S in world), strict=True):
-        baseline[k] = S.scale
-        poses[k] = np.eye(4)
-        poses[k, :3, :3], poses[k, :3, 3] = S.R, S.t
+        baseline[k], poses[k] = S.scale, replace(S, scale=1.0).matrix()
     return poses, baseline
 
 
@@ -319,22 +317,16 @@ def _with_frames(registration: Registration, adjusted: DevicePoses, placed: Comp
     T, baseline, fitness = adjusted.T_world_camera.copy(), adjusted.baseline.copy(), registration.fitness.copy()
     for k, S in placed.items():
         registered[k], component[k], baseline[k], fitness[k] = True, 0, S.scale, 1.0
-        T[k] = np.eye(4)
-        T[k, :3, :3], T[k, :3, 3] = S.R, S.t
+        T[k] = replace(S, scale=1.0).matrix()
     names = {registration.names[k] for k in placed}
     found = replace(
-        registration,
-        registered=registered,
-        component=component,
-        T_world_camera=T,
-        baseline=baseline,
-        fitness=fitness,
+        registration, registered=registered, component=component, T_world_camera=T, baseline=baseline, fitness=fitness,
         exclusions=tuple(e for e in registration.exclusions if e.frame not in names),
-    )
-    return with_edges_at_poses(found, names)
+    )  # fmt: skip
+    return _with_edges_at_poses(found, names)
 
 
-def with_edges_at_poses(registration: Registration, frames: Collection[str]) -> Registration:
+def _with_edges_at_poses(registration: Registration, frames: Collection[str]) -> Registration:
     """The registration; pairs of `frames`, which stand elsewhere now, are used if they say the same rotation."""
     T = dict(zip(registration.names, registration.T_world_camera, strict=True))
 

@@ -29,6 +29,7 @@ from sl_nerfstudio.relative_pose.joint_fit import (
     PRIOR_SIGMA,
     device_with,
     values_of,
+    with_larger_variances,
 )
 from sl_nerfstudio.relative_pose.unknown_projector import LARGEST_SIGMA
 
@@ -599,8 +600,7 @@ class _Adjustment:
         n, m = scores.shape
         meat = scores.T @ scores * (n / max(n - m, n / 4))
         formal, robust = (matrix[m - free :, m - free :] for matrix in (H_inverse, H_inverse @ meat @ H_inverse))
-        growth = np.sqrt(np.maximum(np.diag(robust) / np.diag(formal), 1.0))
-        return growth[:, None] * formal * growth
+        return with_larger_variances(formal, robust)
 
     def _parts(self, points: int) -> Int64[ndarray, "points"]:
         """Number of the square part of the projector's image in which each point lies."""

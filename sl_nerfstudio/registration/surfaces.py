@@ -6,11 +6,11 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
-from sl_nerfstudio.geometry.devices import MODELS, Device, Intrinsics, for_loops
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, for_loops
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, nearest_distances, solve_plane
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.parallel import compiled_range
@@ -87,11 +87,6 @@ class FrameCloud:
     def centroid(self) -> Float64[ndarray, "3"]:
         """Mean of the points."""
         return self.points.mean(0)
-
-    @property
-    def radius(self) -> float:
-        """Root mean square distance of the points from their mean."""
-        return float(np.sqrt(((self.points - self.centroid) ** 2).sum(-1).mean()))
 
 
 def frame_cloud(
@@ -321,6 +316,38 @@ def _cell(place: Float64[ndarray, "n"], factor: float, count: int) -> ndarray:
 
 
 @dataclass(frozen=True)
+class Lattice:
+    """Places of a smaller image, in each of which what points of a cloud say is averaged."""
+
+    camera: Device  # the frame's camera, scaled
+    index: Int64[ndarray, "n"]  # place of each point, row after row
+    count: Int64[ndarray, "h w"]  # points in each place
+
+    @staticmethod
+    def of(camera: Device, uv_camera: Float64[ndarray, "n 2"], largest_side: int) -> "Lattice":
+        """Places of points; at most `largest_side` of them along the longer side of the image."""
+        factor = min(1.0, largest_side / max(camera.w, camera.h))
+        small = camera.scaled(factor)
+        column, row = np.floor(uv_camera * factor).astype(np.int64).T
+        index = np.minimum(row, small.h - 1) * small.w + np.minimum(column, small.w - 1)
+        return Lattice(small, index, np.bincount(index, minlength=small.h * small.w).reshape(small.h, small.w))
+
+    def mean(self, values: Float[ndarray, "n"]) -> Float64[ndarray, "h w"]:
+        """Mean of the points in each place; zero where there are none."""
+        sums = np.bincount(self.index, values, self.count.size).reshape(self.count.shape)
+        return sums / np.maximum(self.count, 1)
+
+    def centres(self) -> Float64[ndarray, "h w 2"]:
+        """Centres of the places, in pixels of the lattice."""
+        h, w = self.count.shape
+        return np.stack(np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5), -1)
+
+    def rays(self) -> Float64[ndarray, "h w 3"]:
+        """Unit directions of the centres."""
+        return directions(self.camera, self.centres().reshape(-1, 2)).reshape(*self.count.shape, 3)
+
+
+@dataclass(frozen=True)
 class FrameView:
     """A guess of which part of a frame other frames see too, as a start of registration."""
 
@@ -353,16 +380,6 @@ class SurfaceMap:
         """One standard deviation of the surface along its normal."""
         return self.plane[..., 4]
 
-    @property
-    def parameters(self) -> Float64[ndarray, "8"]:
-        """PARAMETERS of the map's camera, for compiled loops."""
-        return self.camera.parameters
-
-    @property
-    def model_code(self) -> int:
-        """Model of the map's camera, for compiled loops."""
-        return MODELS[self.camera.model].code
-
     def sample(
         self, count: int, rng: np.random.Generator
     ) -> tuple[Float64[ndarray, "n 3"], Float64[ndarray, "n 3"], Float64[ndarray, "n"]]:
@@ -391,25 +408,14 @@ def build_surface_map(cloud: FrameCloud) -> SurfaceMap:
 
     The inverse depth of a plane is linear in the pixel, so steep parts are not biased by the averaging.
     """
-    factor = min(1.0, LARGEST_SIDE / max(cloud.camera.w, cloud.camera.h))
-    camera = cloud.camera.scaled(factor)
     keep = reliable_points(cloud)
-    column, row = np.floor(cloud.uv_camera[keep] * factor).astype(np.int64).T
-    index = np.minimum(row, camera.h - 1) * camera.w + np.minimum(column, camera.w - 1)
-    size = camera.w * camera.h
-    weight = np.bincount(index, minlength=size)
-    shape = (camera.h, camera.w)
-    mean = np.bincount(index, -1 / cloud.points[keep, 2], size) / np.maximum(weight, 1)
-    inverse_depth = np.where(weight > 0, mean, np.nan).reshape(shape)
-    sigma_noise, *pose_errors = (
-        (np.bincount(index, values, size) / np.maximum(weight, 1)).reshape(shape)
-        for values in (cloud.sigma_noise[keep], *cloud.pose_errors[keep].T)
-    )
+    lattice = Lattice.of(cloud.camera, cloud.uv_camera[keep], LARGEST_SIDE)
+    camera, mean = lattice.camera, lattice.mean
+    inverse_depth = np.where(lattice.count > 0, mean(-1 / cloud.points[keep, 2]), np.nan)
     fitted = np.full((camera.h, camera.w, 3), np.nan)
     planes_of = inverse_depth.astype(np.float32)
     _fit_inverse_depth(camera.h, planes_of, HALF_WINDOW, FEWEST_PIXELS, LARGEST_RELIEF, fitted)
-    uv = np.stack(np.meshgrid(np.arange(camera.w) + 0.5, np.arange(camera.h) + 0.5), -1).reshape(-1, 2)
-    ray = directions(camera, uv).reshape(camera.h, camera.w, 3)
+    ray = lattice.rays()
     ray = ray / -ray[..., 2:]
     point = ray / fitted[..., :1]
     normal = _normals(fitted, ray, camera)
@@ -417,12 +423,13 @@ def build_surface_map(cloud: FrameCloud) -> SurfaceMap:
     with np.errstate(invalid="ignore"):
         valid = np.isfinite(point).all(-1) & (fitted[..., 0] > 0) & (cosine > LEAST_COSINE)
     depth = np.linalg.norm(np.nan_to_num(point), axis=-1)
-    points, place = (point[valid], uv.reshape(*shape, 2)[valid]) if valid.any() else (cloud.points, None)
-    centroid, radius = _centre_and_radius(points)
+    points, place = (point[valid], lattice.centres()[valid]) if valid.any() else (cloud.points, None)
+    centroid, radius = centre_and_radius(points)
     along_normal = np.nan_to_num(np.abs(cosine))
-    sigma = np.hypot(sigma_noise * along_normal, LATTICE_ERROR * depth / camera.fl_x)
+    sigma = np.hypot(mean(cloud.sigma_noise[keep]) * along_normal, LATTICE_ERROR * depth / camera.fl_x)
     if valid.any():
-        errors = np.stack(pose_errors, -1)[valid] * along_normal[valid][:, None]
+        pose_errors = np.stack([mean(values) for values in cloud.pose_errors[keep].T], -1)
+        errors = pose_errors[valid] * along_normal[valid][:, None]
         shape_errors = _beyond_similarity(errors, (point[valid] - centroid) / radius, normal[valid])
         sigma[valid] = np.hypot(sigma[valid], np.linalg.norm(shape_errors, axis=-1))
     return SurfaceMap(
@@ -430,7 +437,7 @@ def build_surface_map(cloud: FrameCloud) -> SurfaceMap:
         np.ascontiguousarray(np.nan_to_num(point)),
         tangent_planes(np.nan_to_num(point), np.nan_to_num(normal), sigma),
         valid,
-        _tone(cloud, keep, index, point, normal, valid),
+        _tone(cloud, keep, point, normal, valid),
         find_empty_places(cloud, camera),
         _orientation_weights(normal[valid]),
         centroid,
@@ -442,20 +449,19 @@ def build_surface_map(cloud: FrameCloud) -> SurfaceMap:
 def _tone(
     cloud: FrameCloud,
     keep: Bool[ndarray, "n"],
-    index: Int64[ndarray, "m"],
     point: Float64[ndarray, "h w 3"],
     normal: Float64[ndarray, "h w 3"],
     valid: Bool[ndarray, "h w"],
 ) -> Float32[ndarray, "h w"]:
-    """The surface's tone on the lattice; `index` is the place in the lattice of each point that is kept."""
+    """The surface's tone on the lattice, from the points that are kept."""
     if cloud.light is None:
         return np.full(valid.shape, np.nan, dtype=np.float32)
-    column, row = np.floor(cloud.uv_camera[keep]).astype(np.int64).T
+    uv_camera = cloud.uv_camera[keep]
+    column, row = np.floor(uv_camera).astype(np.int64).T
     light = cloud.light[row, column]
     known = np.isfinite(light)
-    count = np.bincount(index[known], minlength=valid.size)
-    mean = np.bincount(index[known], light[known], valid.size) / np.maximum(count, 1)
-    light = np.where(valid & (count.reshape(valid.shape) > 0), mean.reshape(valid.shape), np.nan)
+    measured = Lattice.of(cloud.camera, uv_camera[known], LARGEST_SIDE)
+    light = np.where(valid & (measured.count > 0), measured.mean(light[known]), np.nan)
     return surface_tone(light, point, normal, cloud.pose.T_camera_projector[:3, 3])
 
 
@@ -482,7 +488,8 @@ def _orientation_weights(normal: Float64[ndarray, "m 3"]) -> Float64[ndarray, "m
     return 1 / np.sqrt(np.bincount(nearest, minlength=ORIENTATIONS)[nearest])
 
 
-def _centre_and_radius(points: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, "3"], float]:
+def centre_and_radius(points: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, "3"], float]:
+    """The mean of points, and their root mean square distance from it."""
     centroid = points.mean(0)
     return centroid, float(np.sqrt(((points - centroid) ** 2).sum(-1).mean()))
 
@@ -496,7 +503,7 @@ def _views(
     frames see changes size and centre of everything; cameras that look at the object have it in the middle all the
     same, and are about equally far from it.
     """
-    centroid, radius = _centre_and_radius(points)
+    centroid, radius = centre_and_radius(points)
     behind = CENTRE_DEPTH * radius
     views = [FrameView(centroid * (1 + behind / np.linalg.norm(centroid)), radius)]
     if uv is None:

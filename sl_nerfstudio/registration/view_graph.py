@@ -8,14 +8,13 @@ from functools import partial
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 from scipy.special import softmax
 
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.geometry.numerics import component_labels
 from sl_nerfstudio.parallel import tracked
-from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, COARSE_POINTS, Side, Tolerance, agreement_at
+from sl_nerfstudio.registration.agreement import AGREEING_SIGMAS, COARSE_POINTS, Hypotheses, Side, Tolerance, agreement
 from sl_nerfstudio.registration.assembly import Assembly, see_same_side
 from sl_nerfstudio.registration.blocks import BlockReview, OpenBlock, Sides
 from sl_nerfstudio.registration.evidence import Commonness, Frame, KeptResiduals, ScanEvidence
@@ -32,12 +31,7 @@ from sl_nerfstudio.registration.pairs import (
     register_pair,
     search_score,
 )
-from sl_nerfstudio.registration.pose_graph import (
-    Component,
-    Pivots,
-    PoseGraphSolution,
-    optimise_known,
-)
+from sl_nerfstudio.registration.pose_graph import Component, Pivots, PoseGraphSolution, optimise_known
 from sl_nerfstudio.registration.surfaces import SurfaceMap
 
 EXPECTED_OVERLAP = 0.25  # share of common surface that makes a pair worth registering
@@ -346,8 +340,8 @@ class ViewGraph:
         """Register pairs, and keep the better result of a pair that was tried before."""
         rngs = self.rng.spawn(len(trials))
         tasks = [
-            partial(register_pair, self._frames(pair), pair, search, rng, guess, self._known(pair))
-            for (pair, search, guess), rng in zip(trials, rngs, strict=True)
+            partial(register_pair, (self.frames[i], self.frames[j]), (i, j), search, rng, guess, self._known((i, j)))
+            for ((i, j), search, guess), rng in zip(trials, rngs, strict=True)
         ]
         if trials:
             self._components = None
@@ -358,19 +352,16 @@ class ViewGraph:
     def _likeness(self, pairs: Sequence[Pair]) -> list[float]:
         """Score of the best of all starts of each pair."""
         rngs = self.rng.spawn(len(pairs))
-        tasks = [partial(search_score, self._maps(pair), ANYWHERE, rng) for pair, rng in zip(pairs, rngs, strict=True)]
+        tasks = [
+            partial(search_score, (self.maps[i], self.maps[j]), ANYWHERE, rng)
+            for (i, j), rng in zip(pairs, rngs, strict=True)
+        ]
         return tracked(tasks, "comparing frames")
 
-    def _frames(self, pair: Pair) -> tuple[Frame, Frame]:
-        return self.frames[pair[0]], self.frames[pair[1]]
-
     def _known(self, pair: Pair) -> list[Similarity]:
-        """Places of a pair that an earlier search has found."""
+        """Where an earlier search has found that a pair may belong."""
         match = self._tried.get(pair)
-        return [] if match is None else likely_places(match)
-
-    def _maps(self, pair: Pair) -> tuple[SurfaceMap, SurfaceMap]:
-        return self.maps[pair[0]], self.maps[pair[1]]
+        return [] if match is None else [one.S_target_source for one in match.places if one.log_odds > -LEAST_ODDS]
 
     def _overlapping(self, S_world_camera: Component) -> list[Pair]:
         """For every frame the pairs with the largest expected overlap, without those that are edges already."""
@@ -383,8 +374,8 @@ class ViewGraph:
         for i, j in compared_pairs(-sight @ sight.T, COMPARED_FRAMES):
             a, b = S_world_camera.get(i), S_world_camera.get(j)
             if a is not None and b is not None and see_same_side(a, b):
-                maps, S = (self.maps[i], self.maps[j]), b.inverse() @ a
-                found = agreement_at(maps, S, self.rng, tolerance)
+                source, target = (Side.sampled(self.maps[k], COARSE_POINTS, self.rng) for k in (i, j))
+                found = agreement(source, target, Hypotheses.of(b.inverse() @ a), tolerance)
                 shares[i, j] = shares[j, i] = found.agreeing[0]
         pairs: set[Pair] = set()
         for i in range(n):
@@ -476,11 +467,6 @@ def spread_deg(mean_deg: Float64[ndarray, "3"]) -> float:
     return max(LEAST_SPREAD * float(np.linalg.norm(mean_deg)), LEAST_STEP_DEG)
 
 
-def likely_places(match: PairMatch) -> list[Similarity]:
-    """Where a pair may belong: its best place, and those that are nearly as likely."""
-    return [one.S_target_source for one in match.places if one.log_odds > -LEAST_ODDS]
-
-
 def compared_pairs(rank: Float64[ndarray, "n n"], most: int) -> list[Pair]:
     """Pairs (i, j) with i < j of each frame and the `most` others that rank lowest with it (NaN: last), in order."""
     n = len(rank)
@@ -505,11 +491,9 @@ def _connected(component: Component, edges: Sequence[PairMatch]) -> bool:
     inside = [(e.source, e.target) for e in edges if e.source in component and e.target in component]
     if not inside:
         return len(component) < 2
-    place = {frame: k for k, frame in enumerate(component)}
-    rows, columns = np.array([(place[i], place[j]) for i, j in inside]).T
-    size = len(component)
-    links = coo_array((np.ones(len(inside)), (rows, columns)), shape=(size, size))
-    return bool(connected_components(links, directed=False)[0] == 1)
+    number = {frame: k for k, frame in enumerate(component)}
+    first, second = np.array([(number[i], number[j]) for i, j in inside]).T
+    return bool((component_labels(first, second, len(component)) == 0).all())
 
 
 def _relative(nodes: Component, pair: Pair) -> Similarity | None:

@@ -27,8 +27,10 @@ from sl_nerfstudio.relative_pose.epipolar import (
     EpipolarFit,
     RayPairs,
     UnitPose,
+    cross,
     distance_from_curve,
     fit_epipolar,
+    rotated,
     sampson,
     subsample,
 )
@@ -220,11 +222,8 @@ def _in_front(R, t, d_camera, d_projector, front):
     """Compare the signs of the depths along both rays where they are nearest to each other."""
     for i in range(len(front)):
         a, b, c = d_camera[i, 0], d_camera[i, 1], d_camera[i, 2]
-        u, v, w = d_projector[i, 0], d_projector[i, 1], d_projector[i, 2]
-        x = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w
-        y = R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
-        z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
-        p, q, r = b * z - c * y, c * x - a * z, a * y - b * x
-        camera = (t[1] * z - t[2] * y) * p + (t[2] * x - t[0] * z) * q + (t[0] * y - t[1] * x) * r
-        projector = (t[1] * c - t[2] * b) * p + (t[2] * a - t[0] * c) * q + (t[0] * b - t[1] * a) * r
-        front[i] = camera > 0 and projector > 0
+        x, y, z = rotated(R, d_projector[i, 0], d_projector[i, 1], d_projector[i, 2])
+        p, q, r = cross(a, b, c, x, y, z)
+        u, v, w = cross(t[0], t[1], t[2], x, y, z)
+        d, e, f = cross(t[0], t[1], t[2], a, b, c)
+        front[i] = u * p + v * q + w * r > 0 and d * p + e * q + f * r > 0

@@ -19,6 +19,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, for_loops, ray_of, view_of
 from sl_nerfstudio.geometry.least_squares import NormalEquations, minimise
+from sl_nerfstudio.geometry.lie import row_times_rotation
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import compiled
 
@@ -189,6 +190,22 @@ def sampson_jacobian(
 
 
 @compiled
+def rotated(R, x, y, z):
+    """A vector under a rotation, or under the rotation of a rigid motion."""
+    return (
+        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
+        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
+        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
+    )
+
+
+@compiled
+def cross(a, b, c, x, y, z):
+    """The cross product of two vectors."""
+    return b * z - c * y, c * x - a * z, a * y - b * x
+
+
+@compiled
 def _basis(t, B):
     x, y, z = t[0], t[1], t[2]
     u, v, w = abs(x), abs(y), abs(z)
@@ -201,7 +218,7 @@ def _basis(t, B):
     inverse = 1 / np.sqrt(a * a + b * b + c * c)
     a, b, c = a * inverse, b * inverse, c * inverse
     B[0, 0], B[1, 0], B[2, 0] = a, b, c
-    B[0, 1], B[1, 1], B[2, 1] = y * c - z * b, z * a - x * c, x * b - y * a
+    B[0, 1], B[1, 1], B[2, 1] = cross(x, y, z, a, b, c)
 
 
 @compiled
@@ -211,11 +228,10 @@ def _turned(x, y, z, u, v, w):
     angle = np.sqrt(square)
     sine = np.sin(angle) / angle if angle > 1e-8 else 1.0
     half = np.sin(angle / 2) / angle if angle > 1e-8 else 0.5
-    a, b, c = y * w - z * v, z * u - x * w, x * v - y * u
+    a, b, c = cross(x, y, z, u, v, w)
+    p, q, r = cross(x, y, z, a, b, c)
     k = 2 * half * half
-    return (
-        u + sine * a + k * (y * c - z * b), v + sine * b + k * (z * a - x * c), w + sine * c + k * (x * b - y * a)
-    )  # fmt: skip
+    return u + sine * a + k * p, v + sine * b + k * q, w + sine * c + k * r
 
 
 @compiled
@@ -235,10 +251,8 @@ def _move(R, t, step, R_moved, t_moved):
 @compiled
 def _plane(R, t, d):
     """Normal of the epipolar plane of a camera ray: in camera axes, and in those of the projector."""
-    nx, ny, nz = t[1] * d[2] - t[2] * d[1], t[2] * d[0] - t[0] * d[2], t[0] * d[1] - t[1] * d[0]
-    mx = nx * R[0, 0] + ny * R[1, 0] + nz * R[2, 0]
-    my = nx * R[0, 1] + ny * R[1, 1] + nz * R[2, 1]
-    mz = nx * R[0, 2] + ny * R[1, 2] + nz * R[2, 2]
+    nx, ny, nz = cross(t[0], t[1], t[2], d[0], d[1], d[2])
+    mx, my, mz = row_times_rotation(nx, ny, nz, R)
     return nx, ny, nz, mx, my, mz
 
 
@@ -269,11 +283,9 @@ def _derivatives(R, t, A, d_camera, d_projector, by_uv, r, J):
         u = (e[0] - s * (by[0, 0] * h + by[0, 1] * k)) * inverse
         v = (e[1] - s * (by[1, 0] * h + by[1, 1] * k)) * inverse
         w = (e[2] - s * (by[2, 0] * h + by[2, 1] * k)) * inverse
-        x = R[0, 0] * u + R[0, 1] * v + R[0, 2] * w
-        y = R[1, 0] * u + R[1, 1] * v + R[1, 2] * w
-        z = R[2, 0] * u + R[2, 1] * v + R[2, 2] * w
-        J[i, 0], J[i, 1], J[i, 2] = y * nz - z * ny, z * nx - x * nz, x * ny - y * nx
-        p, q, o = y * d[2] - z * d[1], z * d[0] - x * d[2], x * d[1] - y * d[0]
+        x, y, z = rotated(R, u, v, w)
+        J[i, 0], J[i, 1], J[i, 2] = cross(x, y, z, nx, ny, nz)
+        p, q, o = cross(x, y, z, d[0], d[1], d[2])
         J[i, 3] = p * A[0, 0] + q * A[1, 0] + o * A[2, 0]
         J[i, 4] = p * A[0, 1] + q * A[1, 1] + o * A[2, 1]
 
@@ -321,14 +333,9 @@ def fit_epipolar(
         return (width**2 * float(geman_mcclure_cost((residual(pose) / width) ** 2).sum()) + floor) / 2
 
     R, t = minimise(
-        (R, t),
-        equations,
-        lambda pose, step: moved(*pose, step),
-        cost,
-        narrow=narrow,
-        iterations=iterations,
-        tolerance=tolerance,
-    ).state
+        (R, t), equations, lambda pose, step: moved(*pose, step), cost,
+        narrow=narrow, iterations=iterations, tolerance=tolerance,
+    ).state  # fmt: skip
     r = sampson(R, t, rays)
     return EpipolarFit(R, t, r, noise_of(r))
 

@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_weight
 from sl_nerfstudio.parallel import compiled, one_library_thread
 from sl_nerfstudio.relative_pose.candidates import (
@@ -218,19 +219,11 @@ def _relative_pose(
     """A solution with its covariance, inliers and degeneracies."""
     found = solution.fit
     cov = covariance(found, frame.some)
-    degeneracies = find_degeneracies(
-        found,
-        frame.some,
-        np.abs(found.residual) < INLIER_SIGMAS * found.noise_px,
-        (_angle_sigma_deg(cov[:3, :3]), _angle_sigma_deg(cov[3:, 3:])),
-        None if second_best is None else (second_best, solution.explained),
-        frame.blocks,
-    )
+    degeneracies = _degeneracies(solution, second_best, cov, frame)
     noise = _noise_around(sampson(found.R, found.t, frame.rays), frame.rays, found.noise_px)
     inliers, noise_px = np.zeros(frame.correspondences, dtype=bool), np.full(frame.correspondences, np.nan)
     inliers[frame.usable], noise_px[frame.usable] = agree(found.R, found.t, frame.rays, noise), noise
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = found.R, found.t
+    T = Similarity(1.0, found.R, found.t).matrix()
     return RelativePose(T, cov, inliers, found.noise_px, noise_px, solution.explained, degeneracies, alternatives)
 
 
@@ -310,27 +303,17 @@ def _noise_by_block(
 # Degeneracies.
 
 
-def find_degeneracies(
-    found: EpipolarFit,
-    rays: RayPairs,
-    inlier: Bool[ndarray, "n"],
-    sigma_deg: tuple[float, float],
-    explained: tuple[float, float] | None,
-    blocks_of_pattern: int,
+def _degeneracies(
+    solution: Candidate, second_best: float | None, covariance: Float64[ndarray, "5 5"], frame: _Frame
 ) -> tuple[Degeneracy, ...]:
-    """All degeneracies that a frame shows.
-
-    Args:
-        found: the pose.
-        rays: the frame's correspondences.
-        inlier: those that agree with the pose.
-        sigma_deg: standard deviations of rotation and of the baseline's direction.
-        explained: what the second best solution and this one explain, where another explains nearly as much.
-        blocks_of_pattern: number of squares of the whole pattern.
-    """
-    good = rays.chosen(inlier)
-    blocks = len(np.unique(good.block))
+    """All degeneracies that a frame shows; `second_best`: what another solution explains, if nearly as much."""
+    found = solution.fit
     noise = found.noise_px
+    inlier = np.abs(found.residual) < INLIER_SIGMAS * noise
+    good = frame.some.chosen(inlier)
+    blocks = len(np.unique(good.block))
+    sigma_deg = _angle_sigma_deg(covariance[:3, :3]), _angle_sigma_deg(covariance[3:, 3:])
+    explained = () if second_best is None else (second_best, solution.explained)
     least_relief = LEAST_RELIEF_SIGMAS * noise
     plane, rotation = plane_relief(good), rotation_relief(good)
     parallax_deg = float(np.degrees(np.median(ray_angles(found, good))))
@@ -338,13 +321,12 @@ def find_degeneracies(
     too_uncertain = sigma_deg[0] > LARGEST_SIGMA_DEG[0] or sigma_deg[1] > LARGEST_SIGMA_DEG[1]
     rules: tuple[tuple[bool, DegeneracyKind, tuple[float, ...]], ...] = (
         (len(good) < LEAST_POINTS, "few points", (len(good),)),
-        (blocks / blocks_of_pattern < LEAST_BLOCK_SHARE, "small part of the pattern",
-         (blocks, blocks_of_pattern)),
+        (blocks / frame.blocks < LEAST_BLOCK_SHARE, "small part of the pattern", (blocks, frame.blocks)),
         (rotation < least_relief, "pure rotation", (rotation,)),
         (rotation >= least_relief and parallax_deg < LEAST_PARALLAX_DEG, "small parallax", (parallax_deg,)),
         (rotation >= least_relief and plane < least_relief, "planar", (plane,)),
         (epipole_in_view(found, good), "epipole in view", ()),
-        (explained is not None, "ambiguous", explained or ()),
+        (bool(explained), "ambiguous", explained),
         (outliers > LARGEST_OUTLIER_SHARE, "many outliers", (outliers,)),
         (noise > LARGEST_NOISE_PX, "poor fit", (noise,)),
         (too_uncertain, "uncertain", sigma_deg),

@@ -281,7 +281,7 @@ class JointProblem:
             n, p = scores.shape
             if n > 2 * p:
                 meat = scores.T @ scores * (n / (n - p)) + noise**2 * prior
-                found = _larger(found, inverse @ meat @ inverse)
+                found = with_larger_variances(found, inverse @ meat @ inverse)
         return found
 
     def _by_frame(self, scores: Float64[ndarray, "blocks free"]) -> Float64[ndarray, "frames free"]:
@@ -292,7 +292,7 @@ class JointProblem:
         return out
 
 
-def _larger(a: Float64[ndarray, "p p"], b: Float64[ndarray, "p p"]) -> Float64[ndarray, "p p"]:
+def with_larger_variances(a: Float64[ndarray, "p p"], b: Float64[ndarray, "p p"]) -> Float64[ndarray, "p p"]:
     """`a` with variances at least those of `b`; correlations stay."""
     growth = np.sqrt(np.maximum(np.diag(b) / np.diag(a).clip(1e-300), 1.0))
     return growth[:, None] * a * growth
