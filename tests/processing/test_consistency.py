@@ -34,7 +34,7 @@ from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from tests.bundle_adjustment import analytic
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of
-from tests.relative_pose.known_pose import known_pose
+from tests.relative_pose.two_views import known_pose
 
 SIZE, FRAMES, MOVED = 100, 7, 3
 RIG = part_of(rig_of(18, SIZE), list(range(FRAMES)))

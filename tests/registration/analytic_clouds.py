@@ -12,7 +12,7 @@ from sl_nerfstudio.geometry.lie import Similarity, fit_similarity
 from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, images_of
-from tests.relative_pose.known_pose import known_pose
+from tests.relative_pose.two_views import known_pose
 
 
 def clouds_of(rig: Rig, size: int, projector: str = "pinhole", noise: float = 0.0) -> list[FrameCloud]:

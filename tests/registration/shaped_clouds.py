@@ -19,7 +19,7 @@ from sl_nerfstudio.synthesis.render import RenderedCapture
 from sl_nerfstudio.synthesis.synthesise import Setup, make_setup
 from tests.bundle_adjustment.analytic import rig_of
 from tests.registration.analytic_clouds import clouds_of
-from tests.relative_pose.known_pose import known_pose
+from tests.relative_pose.two_views import known_pose
 
 
 @cache

@@ -31,8 +31,7 @@ from sl_nerfstudio.relative_pose.epipolar import correspondences_of, ray_pairs
 from tests.bundle_adjustment.analytic import DISK_HEIGHT, PROJECTORS, camera_of, images_of, rig_of
 from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of, pose_errors, rolled
 from tests.registration.shaped_clouds import RenderedClouds, rendered
-from tests.relative_pose.known_pose import known_pose
-from tests.relative_pose.two_views import errors_deg
+from tests.relative_pose.two_views import errors_deg, known_pose
 
 SIZE, FRAMES = 100, 18  # 20 degrees from frame to frame
 RIG = rig_of(FRAMES, SIZE)

@@ -17,8 +17,7 @@ from sl_nerfstudio.registration.static_projector import (
     resect,
 )
 from sl_nerfstudio.relative_pose.unknown_projector import values_of
-from tests.relative_pose.two_views import pose_of
-from tests.relative_pose.unknown_views import aimed
+from tests.relative_pose.two_views import aimed, pose_of
 
 CAMERA = Device(160, 120, 200.0, 197.0, 81.0, 59.0, k1=-0.05)
 BEAM = Device(640, 400, 1000.0, 1000.0, 310.0, 680.0)

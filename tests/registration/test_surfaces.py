@@ -23,7 +23,7 @@ from sl_nerfstudio.relative_pose.estimation import RelativePoseError, estimate_r
 from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, cast, rig_of, seen
 from tests.registration.analytic_clouds import clouds_of
 from tests.registration.shaped_clouds import cloud_of_depth, with_wall
-from tests.relative_pose.known_pose import known_pose
+from tests.relative_pose.two_views import known_pose
 
 SIZE = 90
 RIG = rig_of(2, SIZE)

@@ -111,6 +111,15 @@ def part_of(frame: View, keep: np.ndarray) -> View:
     return replace(frame, **{k: getattr(frame, k)[keep] for k in ("uv_camera", "uv_projector", "p_camera")})
 
 
+def test_of_a_small_object_the_points_are_few_and_the_pose_is_uncertain():
+    frame = view(count=3000)
+    narrow = part_of(frame, (np.abs(frame.uv_camera - [320, 240]) < 40).all(1))
+    rotation, direction = kinds(narrow.noisy(1.0, seed=0))["uncertain"]
+    assert rotation > 0.5 or direction > 1.5
+    few = kinds(part_of(frame, np.arange(60)).noisy(NOISE, seed=0))["few points"][0]
+    assert 40 < few <= 60
+
+
 @pytest.mark.parametrize("projector", PROJECTORS)
 @pytest.mark.parametrize("offset", [(1.0, 0.25, 0.1), (-0.8, 0.6, 0.3), (0.2, -1.0, -0.2)])
 def test_a_good_frame_has_no_degeneracy(projector, offset):
@@ -125,6 +134,9 @@ def test_a_plane_and_a_pure_rotation_are_told_apart(projector, kind, scene):
     found = kinds(view(projector, **scene).noisy(NOISE, seed=0))
     assert {"planar", "pure rotation", "small parallax"} & found.keys() == {kind}
     assert 0 < found[kind][0] < 6 * NOISE
+    if kind == "planar":  # two poses explain it: the figures are what the second best one explains, and this one
+        second, best = found["ambiguous"]
+        assert 0.5 < second <= best < 1
 
 
 @pytest.mark.parametrize(
@@ -142,31 +154,6 @@ def test_a_degeneracy_is_named_with_its_figure(kind, scene, noise, wrong, figure
     found = kinds(view(**scene).noisy(noise, seed=0, wrong=wrong))
     assert kind != "small parallax" or "pure rotation" not in found
     assert found[kind] == (() if figure is None else (pytest.approx(figure, rel=0.25),))
-
-
-def test_a_corner_of_the_pattern_with_few_points_or_many():
-    frame = view(count=40000).noisy(NOISE, seed=0)
-    corner = np.flatnonzero((frame.uv_projector - frame.uv_projector.min(0) < 150).all(1))
-    many, few = kinds(part_of(frame, corner)), kinds(part_of(frame, corner[:60]))
-    assert "few points" not in many and 40 < few["few points"][0] <= 60
-    for found in (many, few):
-        covered, whole = found["small part of the pattern"]
-        assert whole == 625 and 1 < covered < 30
-
-
-def test_a_thin_object_under_strong_noise_leaves_the_pose_uncertain():
-    frame = view(count=3000)
-    narrow = (np.abs(frame.uv_camera - [320, 240]) < 40).all(1)
-    rotation, direction = kinds(part_of(frame, narrow).noisy(1.0, seed=0))["uncertain"]
-    assert rotation > 0.5 or direction > 1.5
-
-
-def test_a_second_solution():
-    """A plane has two; what the second best one explains, and what this one does, are the figures."""
-    pose = estimate(view(relief=0.0).noisy(NOISE, seed=0))
-    (figures,) = (d.figures for d in pose.degeneracies if d.kind == "ambiguous")
-    assert figures == (pose.alternatives[0].explained, pose.explained)
-    assert 0.5 < figures[0] <= figures[1] < 1
 
 
 @pytest.mark.parametrize(("w", "h"), [(800, 800), (1280, 720), (1920, 1080)])
@@ -204,10 +191,3 @@ def test_what_a_plane_and_a_rotation_explain_leaves_no_relief(projector, seed):
     assert relief(offset=(1e-9, 0.0, 0.0))[1] < 1e-4
     plane, rotation = relief()
     assert plane > 2 and rotation > 3
-
-
-def test_relief_grows_with_the_surface_and_ignores_a_tenth_of_wrong_coordinates():
-    values = [plane_relief(ray_pairs(*view(relief=r).arguments)[0]) for r in (0.1, 0.2)]
-    assert values[1] == pytest.approx(2 * values[0], rel=0.2)
-    flat = view(relief=0.0).noisy(0.0, seed=0, wrong=0.08)
-    assert plane_relief(ray_pairs(*flat.arguments)[0]) < 0.1

@@ -9,8 +9,7 @@ from sl_nerfstudio.geometry.devices import Device, DeviceChange
 from sl_nerfstudio.relative_pose import unknown_projector
 from sl_nerfstudio.relative_pose.joint_fit import LOG_ASPECT, device_with, values_of
 from sl_nerfstudio.relative_pose.unknown_projector import NoProjector, estimate_projector
-from tests.relative_pose.two_views import PROJECTORS
-from tests.relative_pose.unknown_views import SHIFTED, frames_of
+from tests.relative_pose.two_views import PROJECTORS, SHIFTED, frames_of
 
 pytestmark = pytest.mark.slow
 

@@ -1,4 +1,4 @@
-"""One frame by formula: points on a surface, seen by a camera and lit by a projector."""
+"""Frames by formula: points on a surface, seen by a camera and lit by projectors whose poses are known."""
 
 from dataclasses import dataclass, replace
 
@@ -8,6 +8,9 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
+from sl_nerfstudio.relative_pose.epipolar import EpipolarFit, covariance, noise_of, ray_pairs, sampson
+from sl_nerfstudio.relative_pose.estimation import INLIER_SIGMAS, RelativePose
+from sl_nerfstudio.relative_pose.joint_fit import FrameMatches
 from tests.formulas import look_at
 
 CAMERA = Device(640, 480, 800.0, 790.0, 322.0, 238.0)
@@ -89,3 +92,52 @@ def true_pose(frame: View) -> tuple[ndarray, ndarray]:
 def matrix_of(R: ndarray, t: ndarray) -> ndarray:
     """A pose as a matrix."""
     return np.block([[R, t[:, None]], [np.zeros(3), 1.0]])
+
+
+def known_pose(
+    T_camera_projector: ndarray, uv_camera: ndarray, uv_projector: ndarray, camera: Device, projector: Device
+) -> RelativePose:
+    """A relative pose that is known, with the covariance and inliers that a frame's coordinates give it."""
+    rays, usable = ray_pairs(uv_camera, uv_projector, camera, projector)
+    T = T_camera_projector.copy()
+    T[:3, 3] /= np.linalg.norm(T[:3, 3])
+    r = sampson(T[:3, :3], T[:3, 3], rays)
+    fit = EpipolarFit(T[:3, :3], T[:3, 3], r, noise_of(r))
+    inliers, noise_px = np.zeros(len(uv_camera), dtype=bool), np.full(len(uv_camera), np.nan)
+    inliers[usable] = np.abs(r) < INLIER_SIGMAS * fit.noise_px
+    noise_px[usable] = fit.noise_px
+    return RelativePose(T, covariance(fit, rays), inliers, fit.noise_px, noise_px, 1.0, ())
+
+
+SHIFTED = Device(1280, 800, 2000.0, 2000.0, 630.0, 1360.0)
+OFFSETS = ((1.0, 0.25, 0.1), (-0.9, 0.5, 0.3), (0.3, -1.1, -0.2), (0.2, 1.2, 0.6), (-1.2, -0.3, -0.4), (0.9, -0.8, 0.9))
+
+
+def frames_of(
+    projector: Device, count: int, noise: float = 0.0, alike: bool = False, relief: float = 1.0, points: int = 400
+) -> list[FrameMatches]:
+    """Frames under one projector that stands differently in each; `alike`: they differ in their surfaces alone."""
+    frames = []
+    for k in range(count):
+        which = 0 if alike else k
+        seen = view(count=points, seed=k, relief=relief)
+        T = aimed(OFFSETS[which], projector, 60.0 * which)
+        p = (seen.p_camera - T[:3, 3]) @ T[:3, :3]
+        uv, lit = project(Intrinsics.of(projector, torch.float64), torch.from_numpy(p))
+        rng = np.random.default_rng(k)
+        uv = uv.numpy() + noise * rng.standard_normal(uv.shape)
+        assert lit.all()
+        frames.append(FrameMatches(f"frame {k}", seen.uv_camera, uv, CAMERA))
+    return frames
+
+
+def aimed(offset: tuple[float, float, float], projector: Device, roll_deg: float) -> ndarray:
+    """Pose of a projector whose image's middle looks at the surface, wherever its principal point is."""
+    T = pose_of(offset, (0.0, 0.0, -4.5), roll_deg)
+    x = (projector.w / 2 - projector.cx) / projector.fl_x
+    y = -(projector.h / 2 - projector.cy) / projector.fl_y
+    middle = np.array([x, y, -1.0]) / np.linalg.norm([x, y, -1.0])
+    axis = np.cross(middle, [0.0, 0.0, -1.0])
+    if (sine := np.linalg.norm(axis)) > 1e-12:
+        T[:3, :3] = T[:3, :3] @ Rotation.from_rotvec(np.arctan2(sine, -middle[2]) * axis / sine).as_matrix()
+    return T
