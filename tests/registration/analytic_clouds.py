@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.geometry.lie import Similarity, fit_similarity
-from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
+from sl_nerfstudio.registration.surfaces import FrameCloud, centre_and_radius, frame_cloud
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from tests.bundle_adjustment.analytic import PROJECTORS, camera_of, images_of
 from tests.relative_pose.two_views import known_pose
@@ -76,10 +76,11 @@ def rolled(degrees: float) -> ndarray:
 
 def on_a_ball(cloud: FrameCloud, radius: float, name: str) -> FrameCloud:
     """The frame as if it had seen nothing but a ball about the middle of its points."""
-    centre = cloud.centroid * (1 + 0.5 * cloud.radius / np.linalg.norm(cloud.centroid))
+    middle, size = centre_and_radius(cloud.points)
+    centre = middle * (1 + 0.5 * size / np.linalg.norm(middle))
     ray = cloud.points / np.linalg.norm(cloud.points, axis=1, keepdims=True)
     b = ray @ centre
-    root = b * b - centre @ centre + (radius * cloud.radius) ** 2
+    root = b * b - centre @ centre + (radius * size) ** 2
     hit = root > 0
     points = ray[hit] * (b[hit] - np.sqrt(root[hit]))[:, None]
     parts = {k: getattr(cloud, k)[hit] for k in ("uv_camera", "sigma_noise", "pose_errors")}

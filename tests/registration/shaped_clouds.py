@@ -6,13 +6,15 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import torch
 import trimesh
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.pattern.grid import projected_light
-from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
+from sl_nerfstudio.registration.agreement import LEAST_LIT_COSINE
+from sl_nerfstudio.registration.surfaces import EmptyPlaces, FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.render import RenderedCapture
@@ -77,6 +79,19 @@ def relief(x: ndarray, y: ndarray, odd: float) -> ndarray:
     """Distance of a surface that is the same after half a turn about the line of sight where `odd` is 0."""
     even = np.cos(17 * x) * np.cos(11 * y) + np.sin(9 * x) * np.sin(13 * y) + 4 * x * y
     return 3 + 0.06 * even + odd * np.exp(-((x - 0.12) ** 2 + (y - 0.1) ** 2) / 0.006)
+
+
+def seen_and_lit(nothing: EmptyPlaces, p: ndarray, n: ndarray) -> ndarray:
+    """Whether a frame's camera would see points with normals, and its projector's light reach them."""
+    R, t = nothing.T_projector_camera[:3, :3], nothing.T_projector_camera[:3, 3]
+    q, m = p @ R.T + t, n @ R.T
+    towards = [-(a * b).sum(1) / np.linalg.norm(a, axis=1) for a, b in ((p, n), (q, m))]
+    uv, front = project(Intrinsics.of(nothing.projector, torch.float64), torch.from_numpy(q))
+    x, y = np.floor(uv.numpy()).astype(int).T
+    h, w = nothing.reach.shape
+    lit = front.numpy() & (x >= 0) & (y >= 0) & (x < w) & (y < h)
+    lit[lit] &= np.linalg.norm(q[lit], axis=1) < nothing.reach[y[lit], x[lit]]
+    return lit & (np.min(towards, 0) >= LEAST_LIT_COSINE)
 
 
 def with_wall(cloud: FrameCloud, distance: float) -> FrameCloud:

@@ -109,8 +109,7 @@ def test_a_surface_of_a_giant_holds_nothing_together(frames, factor, degrees):
     assert frames_of(assembled(frames, edges)) == [[0, 1, 2, 3], [4, 5, 6, 7]]
 
 
-@pytest.mark.parametrize("partner", [2, 3, 5])
-def test_frames_agree_as_far_as_their_relative_poses_may_err(frames, partner):
+def test_frames_agree_as_far_as_their_relative_poses_may_err(frames):
     """A projector that is off by 1.5 sigma bends and moves its frame's surface by more than its noise."""
     coords, cloud = images_of(RIG, SIZE)[4].numpy(), clouds_of(RIG, SIZE, noise=0.1)[4]
     T, off_deg = cloud.pose.T_camera_projector.copy(), 0.5
@@ -119,8 +118,9 @@ def test_frames_agree_as_far_as_their_relative_poses_may_err(frames, partner):
     pose = replace(cloud.pose, T_camera_projector=T, covariance=covariance)
     bent = frame_evidence(frame_cloud("bent", coords, camera_of(SIZE), cloud.projector, pose))
     scan = evidence_of([*frames[:4], bent, *frames[5:]])
-    odds, agreeing, expected = scan.agreement(4, partner, TRUE[partner].inverse() @ TRUE[4])
-    assert odds > LEAST_ODDS and agreeing > 0.95 * expected > 0.5
+    for partner in (2, 3, 5):
+        odds, agreeing, expected = scan.agreement(4, partner, TRUE[partner].inverse() @ TRUE[4])
+        assert odds > LEAST_ODDS and agreeing > 0.95 * expected > 0.5
 
 
 def test_right_pairs_outvote_a_wrong_one_that_seems_better(frames):

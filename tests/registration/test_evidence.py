@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
-from sl_nerfstudio.registration.agreement import HIDDEN_DEPTH, LEAST_LIT_COSINE
+from sl_nerfstudio.registration.agreement import HIDDEN_DEPTH
 from sl_nerfstudio.registration.evidence import (
     ABSENT,
     ABSENT_SHARE,
@@ -45,7 +45,7 @@ from sl_nerfstudio.registration.pairs import (
 from sl_nerfstudio.registration.surfaces import EmptyPlaces
 from sl_nerfstudio.relative_pose.epipolar import directions
 from tests.registration.graph_edges import exp_at
-from tests.registration.shaped_clouds import cloud_of_body
+from tests.registration.shaped_clouds import cloud_of_body, seen_and_lit
 from tests.relative_pose.two_views import pose_of
 
 PROJECTOR = Device(30, 24, 26.0, 27.0, 15.5, 11.0, k1=0.05)
@@ -87,22 +87,9 @@ def any_frame(camera: Device, seed: int, points: int = 400) -> FrameEvidence:
     T = np.linalg.inv(pose_of((0.6, 0.1, 0.2), (0.0, 0.0, -3.0), 20.0))
     nothing = EmptyPlaces(rng.random((h, w)) < 0.7, PROJECTOR, T, rng.uniform(2.5, 3.5, (24, 30)))
     return FrameEvidence(
-        camera, surface, smooth, nothing, np.concatenate([position, normal, sigma, errors], 1), some,
+        camera, surface, smooth, nothing, np.concatenate([position, normal, sigma, errors], 1),
         position.mean(0), 1.0, 2.0, 0.05, 0.1,
     )  # fmt: skip
-
-
-def lit(nothing: EmptyPlaces, p: ndarray, n: ndarray) -> bool:
-    """Whether the frame's camera would see a place, and its projector's light reach it."""
-    R, t = nothing.T_projector_camera[:3, :3], nothing.T_projector_camera[:3, 3]
-    q, m = R @ p + t, R @ n
-    uv, front = project(Intrinsics.of(nothing.projector, torch.float64), torch.from_numpy(q[None]))
-    column, row = np.floor(uv[0].numpy()).astype(int)
-    h, w = nothing.reach.shape
-    if not (front[0] and 0 <= column < w and 0 <= row < h):
-        return False
-    facing = min(-unit(p) @ n, -unit(q) @ m)
-    return bool(facing >= LEAST_LIT_COSINE and np.linalg.norm(q) < nothing.reach[row, column])
 
 
 def plain(mover: FrameEvidence, seen: FrameEvidence, S: Similarity, own: ndarray, other: ndarray):
@@ -124,7 +111,8 @@ def plain(mover: FrameEvidence, seen: FrameEvidence, S: Similarity, own: ndarray
         surface = np.array([1 - (v - i), v - i]) @ four @ np.array([1 - (u - j), u - j])
         nearest = int(v + 0.5), int(u + 0.5)
         if np.isnan(four).any():
-            out.append((0.0, np.nan, ABSENT if seen.nothing.empty[nearest] and lit(seen.nothing, p, n) else UNDECODED))
+            absent = seen.nothing.empty[nearest] and seen_and_lit(seen.nothing, p[None], n[None])[0]
+            out.append((0.0, np.nan, ABSENT if absent else UNDECODED))
             continue
         block = seen.smooth[nearest[0] // BLOCK, nearest[1] // BLOCK].astype(np.float64)
         behind = distance - surface - block[:5] @ other
@@ -187,7 +175,6 @@ def plane_frame(camera: Device, normal: ndarray, height: float, seed: int) -> Fr
         smooth,
         nothing,
         np.concatenate(parts, 1),
-        rows * w + columns,
         position.mean(0) + normal,
         1.0,
         1.0,

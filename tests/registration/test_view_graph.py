@@ -164,43 +164,23 @@ def test_teeth_that_lead_by_what_pixels_share_do_not_hide_the_usual_step(monkeyp
     assert graph.step is not None and graph.step.deg == pytest.approx(15, abs=2)
 
 
-def test_someone_who_walks_to_and_fro_has_no_usual_step(monkeypatch):
-    """One normal distribution does not tell these turns from small ones in no order."""
-    graph = graph_of(monkeypatch, walk([15.0 * (-1) ** (k // 3) for k in range(FRAMES)]))
-    graph.learn_step()
-    assert graph.step is None
+IN_NO_ORDER = {
+    "someone walks to and fro": lambda small, wide: walk([15.0 * (-1) ** (k // 3) for k in range(FRAMES)]),
+    "no frames between": lambda small, wide: [pair(k, k + 1, 15.0) for k in range(FRAMES - 1)],
+    "large turns": lambda small, wide: [pair(k, k + 1, wide[k]) for k in range(FRAMES - 1)],
+    # as all pairs of an object allow that looks the same after every 40 degrees
+    "turns that do not grow with the gap": lambda small, wide: [
+        pair(k, k + gap, small[gap - 1][k]) for gap in (1, 2) for k in range(FRAMES - gap)
+    ],
+    "most slip": lambda small, wide: [pair(k, k + 1, slip=12.0 * (k > 1)) for k in range(FRAMES - 1)],
+}
 
 
-def test_without_frames_between_nothing_says_that_there_is_an_order(monkeypatch):
-    graph = graph_of(monkeypatch, [pair(k, k + 1, 15.0) for k in range(FRAMES - 1)])
-    graph.learn_step()
-    assert graph.step is None
-
-
-def test_frames_that_follow_each_other_in_no_order_have_no_usual_step(monkeypatch):
-    turns = np.random.default_rng(0).uniform(20, 170, FRAMES)
-    graph = graph_of(monkeypatch, [pair(k, k + 1, float(turns[k])) for k in range(FRAMES - 1)])
-    graph.learn_step()
-    assert graph.step is None and graph.usual_step(0, 1, turned(170.0)) == 0.0
-
-
-def test_turns_that_do_not_grow_with_the_number_of_frames_between_are_of_no_order(monkeypatch):
-    """Small ones, as all pairs of an object allow that looks the same after every 40 degrees."""
-    turns = np.random.default_rng(1).uniform(-20, 20, (2, FRAMES))
-    pairs = [pair(k, k + gap, float(turns[gap - 1, k])) for gap in (1, 2) for k in range(FRAMES - gap)]
-    graph = graph_of(monkeypatch, pairs)
-    graph.learn_step()
-    assert graph.step is None
-    ordered = [pair(k, k + gap, 15.0 * gap + turns[gap - 1, k] / 10) for gap in (1, 2) for k in range(FRAMES - gap)]
-    graph = graph_of(monkeypatch, ordered)
-    graph.learn_step()
-    assert graph.step is not None and graph.step.deg == pytest.approx(15, abs=1)
-
-
-def test_where_most_successive_frames_slip_the_order_says_nothing(monkeypatch):
-    """A vase."""
-    pairs = [pair(k, k + 1, slip=12.0 * (k > 1)) for k in range(FRAMES - 1)]
-    graph = graph_of(monkeypatch, pairs)
+@pytest.mark.parametrize("case", IN_NO_ORDER)
+def test_frames_in_no_order_have_no_usual_step(monkeypatch, case):
+    small = np.random.default_rng(1).uniform(-20, 20, (2, FRAMES)).tolist()
+    wide = np.random.default_rng(0).uniform(20, 170, FRAMES).tolist()
+    graph = graph_of(monkeypatch, IN_NO_ORDER[case](small, wide))
     graph.learn_step()
     assert graph.step is None and graph.usual_step(0, 1, turned(170.0)) == 0.0
 
