@@ -298,20 +298,10 @@ def triangulated(
     return points
 
 
-def place_next(
-    rays: Float64[ndarray, "cells 3"], points: Float64[ndarray, "cells 3"], camera: Device
-) -> Float64[ndarray, "4 4"] | None:
-    """Pose of a camera against known points (PnP with RANSAC); None where it has too few or no pose fits."""
-    both = np.isfinite(rays[:, 0]) & np.isfinite(points[:, 0])
-    if both.sum() < FEWEST_COMMON:
-        return None
-    return posed(points[both], rays[both], 3 * OUTLIER_PX / camera.fl_x, 0.5)
-
-
 def posed(
     points: Float64[ndarray, "n 3"], d: Float64[ndarray, "n 3"], threshold: float, least_share: float
 ) -> Float64[ndarray, "4 4"] | None:
-    """T_world_device of a device that sees points along unit rays; None where no pose fits enough of them.
+    """T_world_device of a device that sees points along unit rays (PnP with RANSAC); None where none fits enough.
 
     `threshold`: distance in normalised coordinates within which a point fits.
     """
@@ -643,11 +633,14 @@ def _grown(
         left = sorted((int(k) for k in np.flatnonzero(~placed) if k not in failed), key=lambda k: -seen[k])
         if not left:
             return T if placed.sum() == adjusted_with else _adjusted_cameras(T, rays, cells, cameras)
-        pose = place_next(rays[left[0]], points, cameras[left[0]])
+        k = left[0]
+        both = np.isfinite(rays[k, :, 0]) & np.isfinite(points[:, 0])
+        enough = both.sum() >= FEWEST_COMMON
+        pose = posed(points[both], rays[k, both], 3 * OUTLIER_PX / cameras[k].fl_x, 0.5) if enough else None
         if pose is None:
-            failed.add(left[0])
+            failed.add(k)
         else:
-            T[left[0]] = pose
+            T[k] = pose
             failed.clear()
 
 

@@ -287,8 +287,12 @@ def find_empty_places(cloud: FrameCloud, camera: Device) -> EmptyPlaces:
     if cloud.seen is None:
         nowhere = np.zeros((camera.h, camera.w), dtype=bool)
         return EmptyPlaces(nowhere, projector, T, np.zeros((projector.h, projector.w)))
-    empty = _empty(cloud.seen, camera)
-    return EmptyPlaces(empty, projector, T, _reach(cloud, projector, T, factor))
+    uv = correspondences_of(cloud.coords)[1]
+    distance = np.linalg.norm(cloud.points @ T[:3, :3].T + T[:3, 3], axis=1)
+    cells = _cell(uv[:, 1], factor, projector.h), _cell(uv[:, 0], factor, projector.w)
+    reach = nearest_distances(cells, distance, (projector.h, projector.w))
+    reach[[0, -1]] = reach[:, [0, -1]] = 0.0
+    return EmptyPlaces(_empty(cloud.seen, camera), projector, T, reach)
 
 
 def _empty(pattern_seen: Bool[ndarray, "H W"], camera: Device) -> Bool[ndarray, "h w"]:
@@ -298,17 +302,6 @@ def _empty(pattern_seen: Bool[ndarray, "H W"], camera: Device) -> Bool[ndarray, 
     seen[_cell(row + 0.5, factor, camera.h), _cell(column + 0.5, factor, camera.w)] = True
     around = np.pad(seen, 1, constant_values=True)  # what is beside the image is not known
     return np.asarray(distance_transform_edt(~around))[1:-1, 1:-1] > EMPTY_MARGIN * max(camera.w, camera.h)
-
-
-def _reach(
-    cloud: FrameCloud, projector: Device, T_projector_camera: Float64[ndarray, "4 4"], factor: float
-) -> Float64[ndarray, "a b"]:
-    uv = correspondences_of(cloud.coords)[1]
-    distance = np.linalg.norm(cloud.points @ T_projector_camera[:3, :3].T + T_projector_camera[:3, 3], axis=1)
-    cells = _cell(uv[:, 1], factor, projector.h), _cell(uv[:, 0], factor, projector.w)
-    reach = nearest_distances(cells, distance, (projector.h, projector.w))
-    reach[[0, -1]] = reach[:, [0, -1]] = 0.0
-    return reach
 
 
 def _cell(place: Float64[ndarray, "n"], factor: float, count: int) -> ndarray:
