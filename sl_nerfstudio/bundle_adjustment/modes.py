@@ -31,7 +31,7 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     gauge_directions,
     restore,
 )
-from sl_nerfstudio.bundle_adjustment.posterior import GROSS, Odds, odds
+from sl_nerfstudio.bundle_adjustment.posterior import GROSS, Odds, odds, with_slides
 from sl_nerfstudio.bundle_adjustment.registered_start import registered_start
 from sl_nerfstudio.bundle_adjustment.residuals import Rig, linearise
 from sl_nerfstudio.bundle_adjustment.search import (
@@ -45,7 +45,6 @@ from sl_nerfstudio.bundle_adjustment.search import (
     search,
     unplaced_frames,
 )
-from sl_nerfstudio.bundle_adjustment.slides import with_slides
 from sl_nerfstudio.geometry.lie import exp_se3, exp_so3, inverse, log_se3, log_so3
 from sl_nerfstudio.parallel import results
 
@@ -183,7 +182,7 @@ def with_others(
 
     Further searches begin at poses as uncertain as the starting ones, which are their prior, if the result, shaken,
     does not lead back. Ends in its valley count by what look-ups say, as it may be within its error. Then each frame
-    alone may have slid (`slides`). Frames that no search has placed are passed over.
+    alone may have slid (`with_slides`). Frames that no search has placed are passed over.
     """
     problem, rig, noise = found.problem, found.rig, found.best.noise
     if not (problem.settings.other_minima and found.may_differ):

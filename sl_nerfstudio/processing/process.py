@@ -20,7 +20,16 @@ from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import ShownImage
-from sl_nerfstudio.processing.cache import StageStore, work_folder
+from sl_nerfstudio.processing.cache import (
+    StageStore,
+    WrittenScan,
+    digest_of_captures,
+    note_scan,
+    note_work,
+    with_kept_work,
+    work_folder,
+    written_scan,
+)
 from sl_nerfstudio.processing.captures import describe_faults
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
 from sl_nerfstudio.processing.consistency import (
@@ -28,14 +37,6 @@ from sl_nerfstudio.processing.consistency import (
     adjust_consistent,
     compare_registered,
     registered_only,
-)
-from sl_nerfstudio.processing.earlier_runs import (
-    WrittenScan,
-    digest_of_captures,
-    note_scan,
-    note_work,
-    with_kept_work,
-    written_scan,
 )
 from sl_nerfstudio.processing.frames import (
     FrameJob,
