@@ -429,7 +429,7 @@ def _weak_connections(facts: ScanFacts) -> Iterator[Reason]:
     index = {name: k for k, name in enumerate(names)}
     if len(names) < 3:
         return  # the only pair: nothing could confirm it but the agreement of its coordinates, which is judged
-    for (a, b), part in bridges([(index[a], index[b]) for a, b in used], range(len(names))):
+    for (a, b), part in bridges([(index[a], index[b]) for a, b in used], len(names)):
         yield Reason(
             "acceptable",
             f"only the pair {names[a]} and {names[b]} connects {listed([names[k] for k in part])} to the other frames; "
