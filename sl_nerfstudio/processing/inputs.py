@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -243,7 +243,7 @@ class CaptureNotes:
 
     def document(self) -> dict[str, Any]:
         """Return the figures as JSON."""
-        video = None if self.video is None else self.video.document()
+        video = None if self.video is None else asdict(self.video)
         names = {"sequence": self.sequence, "sequence_recognised": self.recognised}
         return {**names, "video": video, "shrunk_by": self.shrink, "camera_focal": self.camera}
 

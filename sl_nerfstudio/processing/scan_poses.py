@@ -98,7 +98,13 @@ class PlacedGroup:
 
     def only_object(self, parts: dict[str, UInt8[ndarray, "h w"]]) -> "PlacedGroup":
         """Leave out the points of surroundings. `parts` is what each pixel shows (`Part`), by the frame's name."""
-        frames = (_only_object(f, parts[f.name]) if f.name in parts else f for f in self.frames)
+        frames = []
+        for frame in self.frames:
+            if frame.name in parts:
+                column, row = np.floor(frame.uv_camera).astype(np.int64).T
+                keep = parts[frame.name][row, column] == Part.OBJECT
+                frame = replace(frame, points=frame.points[keep], uv_camera=frame.uv_camera[keep])
+            frames.append(frame)
         return replace(self, frames=tuple(frames))
 
 
@@ -152,9 +158,3 @@ def _at(
     seen = (found.depth_camera > 0).numpy()
     points = found.p_world.numpy()[seen].astype(np.float32)
     return PlacedFrame(cloud.name, cloud.camera, cloud.projector, T_world_camera, T_world_projector, points, uv[seen])
-
-
-def _only_object(frame: PlacedFrame, part: UInt8[ndarray, "h w"]) -> PlacedFrame:
-    column, row = np.floor(frame.uv_camera).astype(np.int64).T
-    keep = part[row, column] == Part.OBJECT
-    return replace(frame, points=frame.points[keep], uv_camera=frame.uv_camera[keep])

@@ -5,9 +5,8 @@ the poses are kept.
 """
 
 from dataclasses import dataclass, fields, replace
-from math import degrees, radians
+from math import radians
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -29,7 +28,7 @@ from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, constrained
 from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
-from sl_nerfstudio.geometry.lie import fit_similarity, log_so3
+from tests.formulas import pose_errors
 
 from . import analytic
 from .analytic import ExactMaps, decoded_at, disturbed, images_of, prior_of, rig_of, static_rig
@@ -47,14 +46,10 @@ PRIOR = loose_prior(FRAMES)
 
 
 def errors(found: Rig, true: Rig) -> tuple[float, float]:
-    """Largest error of relative rotations between cameras (degree) and of aligned positions (scene units)."""
-    R, Q = found.T_world_camera[:, :3, :3], true.T_world_camera[:, :3, :3]
-    turns = (R.transpose(1, 2)[:, None] @ R[None]) @ (Q.transpose(1, 2)[:, None] @ Q[None]).transpose(-1, -2)
-    at, expected = (
-        torch.cat([r.T_world_camera[:, :3, 3], r.T_world_projector[:, :3, 3]]).numpy() for r in (found, true)
-    )
-    aligned = fit_similarity(at, expected).points(at)
-    return degrees(float(log_so3(turns).norm(dim=-1).max())), float(np.abs(aligned - expected).max())
+    """Largest error of rotations (degree) and of positions (scene units) of all devices, when they are aligned."""
+    both = (torch.cat([rig.T_world_camera, rig.T_world_projector]).numpy() for rig in (found, true))
+    _, degrees, off = pose_errors(*both)
+    return float(degrees.max()), float(off.max())
 
 
 def assert_recovered(found: Rig, true: Rig) -> None:

@@ -17,6 +17,7 @@ from sl_nerfstudio.bundle_adjustment.modes import (
     explore,
     farthest_frame,
     is_rough,
+    registered_start,
     shake,
     with_others,
 )
@@ -27,7 +28,6 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     baseline_scale,
     restore,
 )
-from sl_nerfstudio.bundle_adjustment.registered_start import registered_start
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.search import (
     AdjustmentSettings,

@@ -113,18 +113,6 @@ def test_two_runs_in_one_place_are_refused(config):
     assert not config.work_folder.exists()
 
 
-def test_outputs_are_not_in_each_other_and_not_among_the_captures(config):
-    for work in (config.output, config.output / "inside", config.output / ".." / config.output.name):
-        with pytest.raises(UserError, match=r"--work .*: is in the output(.|\n)*such as .*scan.work"):
-            run(replace(config, work=work))
-    for inside in (config.images, config.images / "scan"):
-        with pytest.raises(UserError, match=r"--output .*: is in the captures(.|\n)*such as .*/scan$"):
-            run(replace(config, output=inside))
-        with pytest.raises(UserError, match=r"--work .*: is in the captures"):
-            run(replace(config, work=inside))
-    assert not config.output.exists() and not (config.images / "scan").exists()
-
-
 def nothing_slow(monkeypatch):
     for module, name in ((stages, "register"), (stages, "adjust_consistent"), (frames, "estimate_relative_pose")):
         monkeypatch.setattr(module, name, lambda *_, name=name: pytest.fail(f"{name} was called again"))
