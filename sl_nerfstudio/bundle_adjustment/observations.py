@@ -174,12 +174,12 @@ def _surface(
     rig: Rig, frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"], seen: MapSample
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
     """Points where rays meet, normals towards the camera, in its axes; whether they meet in front of both devices."""
-    p, good = _meet(rig, frame, uv, seen.uv_projector)
+    p, _, good = where_rays_meet(rig, frame, uv, seen.uv_projector)
     edges = []
     for axis in range(2):
         step, change = _STEP * torch.eye(2, dtype=uv.dtype)[axis], _STEP * seen.jacobian[..., axis]
-        far = _meet(rig, frame, uv + step, seen.uv_projector + change)[0]
-        edges.append(far - _meet(rig, frame, uv - step, seen.uv_projector - change)[0])
+        far = where_rays_meet(rig, frame, uv + step, seen.uv_projector + change)[0]
+        edges.append(far - where_rays_meet(rig, frame, uv - step, seen.uv_projector - change)[0])
     normal = torch.nn.functional.normalize(torch.linalg.cross(edges[0], edges[1]), dim=-1)
     return p, -normal * (normal * p).sum(-1, keepdim=True).sign(), good
 
@@ -187,20 +187,23 @@ def _surface(
 def in_front_of(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps) -> Bool[Tensor, "rows"]:
     """Whether the surface that a camera sees where it looks an anchor up is nearer to it than the anchor is."""
     uv, _ = pixels_of_rows(rig, anchors, rows)
-    seen, _ = _meet(rig, rows.frame, uv, maps.look_up(rows.frame, uv, rows.memory).uv_projector)
+    seen, *_ = where_rays_meet(rig, rows.frame, uv, maps.look_up(rows.frame, uv, rows.memory).uv_projector)
     p_world = transform(rig.T_world_camera[anchors.frame], anchors.depth[:, None] * anchors.d_camera)[rows.anchor]
     return seen.norm(dim=-1) < (p_world - rig.T_world_camera[rows.frame, :3, 3]).norm(dim=-1)
 
 
-def _meet(
+def where_rays_meet(
     rig: Rig, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"], uv_projector: Float[Tensor, "n 2"]
-) -> tuple[Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-    """Points on camera rays nearest to their projector rays, in camera axes; whether in front of both devices."""
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"], Bool[Tensor, "n"]]:
+    """Points on camera rays nearest to their projector rays, in camera axes, and their depths along these.
+
+    And whether they are in front of both devices.
+    """
     d_camera = unproject(rig.camera[frame], uv_camera)
     T = rig.T_camera_projector[frame]
     d_projector = rotate(T, unproject(rig.projector, uv_projector))
     depth, depth_projector = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], d_projector)
-    return depth[..., None] * d_camera, (depth > 0) & (depth_projector > 0)
+    return depth[..., None] * d_camera, depth, (depth > 0) & (depth_projector > 0)
 
 
 def observe(

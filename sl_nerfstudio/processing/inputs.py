@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +36,10 @@ from sl_nerfstudio.processing.captures import (
     Captures,
     describe_sequence,
     find_captures,
+    find_pictures,
     incomplete,
     layout_in_order,
+    picture_sentences,
     recognise_sequence,
     resolution,
 )
@@ -51,7 +53,6 @@ from sl_nerfstudio.processing.frames import (
     with_kept_cloud,
 )
 from sl_nerfstudio.processing.masks import find_masks
-from sl_nerfstudio.processing.pictures import find_pictures, picture_sentences
 from sl_nerfstudio.processing.records import DecodedStore, LargeClouds
 from sl_nerfstudio.processing.video import VideoChoice, is_video, video_frames
 from sl_nerfstudio.registration.result import KnownLength, is_index, parse_known_length
@@ -242,7 +243,7 @@ class CaptureNotes:
 
     def document(self) -> dict[str, Any]:
         """Return the figures as JSON."""
-        video = None if self.video is None else self.video.document()
+        video = None if self.video is None else asdict(self.video)
         names = {"sequence": self.sequence, "sequence_recognised": self.recognised}
         return {**names, "video": video, "shrunk_by": self.shrink, "camera_focal": self.camera}
 

@@ -20,7 +20,15 @@ from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import ShownImage
-from sl_nerfstudio.processing.cache import StageStore, work_folder
+from sl_nerfstudio.processing.cache import (
+    StageStore,
+    digest_of_captures,
+    note_scan,
+    note_work,
+    with_kept_work,
+    work_folder,
+    written_scan,
+)
 from sl_nerfstudio.processing.captures import describe_faults
 from sl_nerfstudio.processing.config import FEWEST_FRAMES, ProcessConfig
 from sl_nerfstudio.processing.consistency import (
@@ -28,14 +36,6 @@ from sl_nerfstudio.processing.consistency import (
     adjust_consistent,
     compare_registered,
     registered_only,
-)
-from sl_nerfstudio.processing.earlier_runs import (
-    WrittenScan,
-    digest_of_captures,
-    note_scan,
-    note_work,
-    with_kept_work,
-    written_scan,
 )
 from sl_nerfstudio.processing.frames import (
     FrameJob,
@@ -229,52 +229,41 @@ def process(config: ProcessConfig, make_report: MakeReport, log: Log, watch: Wat
     earlier = written_scan(config)
     renewed = () if earlier is None else tuple(earlier.files)
     with NewFolder(config.output, renewed) as folder, work_folder(config.work_folder):
-        return _process(config, folder, earlier, make_report, log, watch)
-
-
-def _process(
-    config: ProcessConfig,
-    folder: NewFolder,
-    earlier: WrittenScan | None,
-    make_report: MakeReport,
-    log: Log,
-    watch: Watch | None,
-) -> ProcessResult:
-    with phase("read"):
-        inputs = read_inputs(config)
-        note_work(config)
-        captures, decoder = inputs.captures, inputs.job.decoder.name
-        log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
-        for sentence in (*inputs.notes.sentences, *(f"left out: {fault}" for fault in describe_faults(captures))):
-            log(sentence)
-        if of_earlier_version(config.work_folder, inputs.job.decoder):
-            log(f"{config.work_folder} was filled by an earlier version: its frames are decoded again")
-        digest = digest_of_captures(captures)
-        if earlier is not None:
-            earlier.require_same(digest, config.output)
-            log(f"{config.output} holds an earlier scan of the same captures, which this one replaces")
-    run = _Run(config, inputs, make_report, log)
-    with phase("decode"):
-        frames = run.calibrated()
-        wrong = run.wrong_intrinsics(frames)
-    with phase("register"):
-        frames, registration = run.registered(frames)
-        run.require_registered(frames.results, registration, wrong)
-        if watch is not None:
-            clouds = clouds_of(frames.results)
-            watch(clouds, keep_registered(clouds, registration).poses, "registered")
-    with phase("adjust"):
-        frames, consistent = run.adjusted(frames, registration)
-        frames, consistent, moving = run.registered_by_what_moves(frames, consistent)
-        both = consistent.adjusted.median_before_px, consistent.adjusted.median_after_px
-        if np.isfinite(both).all():
-            log("frames agree to {1:.2f} px, {0:.2f} px before".format(*both))
-        if watch is not None:
-            watch(clouds_of(frames.results), consistent.adjusted.poses, "adjusted together")
-    with phase("write"):
-        result = run.written(folder, frames, consistent, moving, wrong)
-        note_scan(config, folder, digest)
-    return result
+        with phase("read"):
+            inputs = read_inputs(config)
+            note_work(config)
+            captures, decoder = inputs.captures, inputs.job.decoder.name
+            log(f"{len(captures.frames)} frames of {captures.size[0]} x {captures.size[1]} pixels, decoder {decoder}")
+            for sentence in (*inputs.notes.sentences, *(f"left out: {fault}" for fault in describe_faults(captures))):
+                log(sentence)
+            if of_earlier_version(config.work_folder, inputs.job.decoder):
+                log(f"{config.work_folder} was filled by an earlier version: its frames are decoded again")
+            digest = digest_of_captures(captures)
+            if earlier is not None:
+                earlier.require_same(digest, config.output)
+                log(f"{config.output} holds an earlier scan of the same captures, which this one replaces")
+        run = _Run(config, inputs, make_report, log)
+        with phase("decode"):
+            frames = run.calibrated()
+            wrong = run.wrong_intrinsics(frames)
+        with phase("register"):
+            frames, registration = run.registered(frames)
+            run.require_registered(frames.results, registration, wrong)
+            if watch is not None:
+                clouds = clouds_of(frames.results)
+                watch(clouds, keep_registered(clouds, registration).poses, "registered")
+        with phase("adjust"):
+            frames, consistent = run.adjusted(frames, registration)
+            frames, consistent, moving = run.registered_by_what_moves(frames, consistent)
+            both = consistent.adjusted.median_before_px, consistent.adjusted.median_after_px
+            if np.isfinite(both).all():
+                log("frames agree to {1:.2f} px, {0:.2f} px before".format(*both))
+            if watch is not None:
+                watch(clouds_of(frames.results), consistent.adjusted.poses, "adjusted together")
+        with phase("write"):
+            result = run.written(folder, frames, consistent, moving, wrong)
+            note_scan(config, folder, digest)
+        return result
 
 
 @dataclass(frozen=True)

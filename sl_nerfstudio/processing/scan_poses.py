@@ -4,14 +4,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float32, Float64, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.bundle_adjustment.registered_frames import AdjustedFrames
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.devices import Device, Intrinsics
-from sl_nerfstudio.geometry.triangulation import triangulate
+from sl_nerfstudio.geometry.devices import Device
+from sl_nerfstudio.geometry.triangulation import triangulate_pixels
 from sl_nerfstudio.object_separation.separate import Part
 from sl_nerfstudio.processing.frames import FrameStageResult, clouds_of
 from sl_nerfstudio.processing.inputs import GivenPoses, align_to
@@ -99,7 +98,13 @@ class PlacedGroup:
 
     def only_object(self, parts: dict[str, UInt8[ndarray, "h w"]]) -> "PlacedGroup":
         """Leave out the points of surroundings. `parts` is what each pixel shows (`Part`), by the frame's name."""
-        frames = (_only_object(f, parts[f.name]) if f.name in parts else f for f in self.frames)
+        frames = []
+        for frame in self.frames:
+            if frame.name in parts:
+                column, row = np.floor(frame.uv_camera).astype(np.int64).T
+                keep = parts[frame.name][row, column] == Part.OBJECT
+                frame = replace(frame, points=frame.points[keep], uv_camera=frame.uv_camera[keep])
+            frames.append(frame)
         return replace(self, frames=tuple(frames))
 
 
@@ -148,17 +153,8 @@ def _at(
     good = np.flatnonzero(reliable_points(cloud))
     uv = cloud.uv_camera[good[np.linspace(0, len(good) - 1, min(most, len(good))).astype(np.int64)]]
     column, row = np.floor(uv).astype(np.int64).T
-    found = triangulate(
-        Intrinsics.of(cloud.camera, torch.float64), torch.from_numpy(T_world_camera), torch.from_numpy(uv),
-        Intrinsics.of(cloud.projector, torch.float64), torch.from_numpy(T_world_projector),
-        torch.from_numpy(cloud.coords[row, column].astype(np.float64)),
-    )  # fmt: skip
+    devices = cloud.camera, cloud.projector, T_world_camera, T_world_projector
+    found = triangulate_pixels(*devices, cloud.coords, row, column)
     seen = (found.depth_camera > 0).numpy()
     points = found.p_world.numpy()[seen].astype(np.float32)
     return PlacedFrame(cloud.name, cloud.camera, cloud.projector, T_world_camera, T_world_projector, points, uv[seen])
-
-
-def _only_object(frame: PlacedFrame, part: UInt8[ndarray, "h w"]) -> PlacedFrame:
-    column, row = np.floor(frame.uv_camera).astype(np.int64).T
-    keep = part[row, column] == Part.OBJECT
-    return replace(frame, points=frame.points[keep], uv_camera=frame.uv_camera[keep])

@@ -5,7 +5,6 @@ import json
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -141,10 +140,6 @@ class VideoChoice:
             f"{self.blurred} frames are blurred (sharpness below {self.least_sharpness:.2f})",
         ]
 
-    def document(self) -> dict[str, Any]:
-        """Return the record as JSON."""
-        return asdict(self)
-
 
 def is_video(path: Path) -> bool:
     """Whether a path names a video file."""
@@ -166,7 +161,7 @@ def video_frames(path: Path, work: Path) -> tuple[Path, VideoChoice]:
         for number, _, pixels in track(_decoded(path, "rgb24"), "keeping frames", kept.frames_in_video):
             if number in numbers:
                 write_atomic(folder / f"{numbers[number]}.png", encode_png(pixels))
-        write_atomic(folder / _RECORD, encode_json(kept.document()))
+        write_atomic(folder / _RECORD, encode_json(asdict(kept)))
     return folder, kept
 
 

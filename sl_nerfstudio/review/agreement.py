@@ -17,9 +17,9 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
-from sl_nerfstudio.bundle_adjustment.observations import observe, partners, place_anchors
+from sl_nerfstudio.bundle_adjustment.observations import observe, partners, place_anchors, where_rays_meet
 from sl_nerfstudio.bundle_adjustment.residuals import Anchors, Linearisation, Observations, Rig, linearise
-from sl_nerfstudio.geometry.devices import Device, project, unproject
+from sl_nerfstudio.geometry.devices import Device, project
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on, inverse, rotate, transform
 from sl_nerfstudio.geometry.numerics import (
     MAD_TO_SIGMA,
@@ -28,7 +28,7 @@ from sl_nerfstudio.geometry.numerics import (
     geman_mcclure_weight,
     nearest_distances,
 )
-from sl_nerfstudio.geometry.triangulation import Triangulation, closest_approach, triangulate_pixels, world_pixels
+from sl_nerfstudio.geometry.triangulation import Triangulation, triangulate_pixels, world_pixels
 from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.scan.types import PoseSigma, Scan
 
@@ -303,11 +303,8 @@ def _in_front(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMa
     p_world = transform(rig.T_world_camera[anchors.frame[a]], (anchors.depth[:, None] * anchors.d_camera)[a])
     p_j = transform(inverse(rig.T_world_camera)[j], p_world)
     uv, _ = project(rig.camera[j], p_j)
-    d_camera = unproject(rig.camera[j], uv)
-    T = rig.T_camera_projector[j]
-    d_projector = rotate(T, unproject(rig.projector, maps.look_up(j, uv).uv_projector))
-    depth, beyond = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], d_projector)
-    return (beyond > 0) & (p_j.norm(dim=-1) < depth)  # False where the rays do not meet
+    _, depth, meet = where_rays_meet(rig, j, uv, maps.look_up(j, uv).uv_projector)
+    return meet & (p_j.norm(dim=-1) < depth)
 
 
 # Cross-frame agreement of a scan, from its devices, poses and coordinate images in any world and unit.
@@ -407,25 +404,15 @@ def _best(votes: Float[ndarray, "n n"]) -> Pair | None:
     return (int(i), int(j)) if i < j and votes[i, j] > 0 else None
 
 
-def components(edges: Sequence[Pair], nodes: Iterable[int]) -> list[list[int]]:
-    """Groups of nodes that edges connect, the largest first."""
-    names = list(nodes)
-    index = {k: n for n, k in enumerate(names)}
-    ends = np.array([(index[a], index[b]) for a, b in edges], dtype=np.int64).reshape(-1, 2)
-    label = component_labels(ends[:, 0], ends[:, 1], len(names))
-    groups = [[names[n] for n in np.flatnonzero(label == c)] for c in np.unique(label)]
-    return sorted(groups, key=lambda group: (-len(group), group[0]))
-
-
-def bridges(edges: Sequence[Pair], nodes: Iterable[int]) -> list[tuple[Pair, list[int]]]:
-    """Edges whose removal splits the graph, each with the nodes of the smaller part."""
-    names = list(nodes)
-    whole = len(components(edges, names))
+def bridges(edges: Sequence[Pair], nodes: int) -> list[tuple[Pair, list[int]]]:
+    """Edges whose removal splits the graph of so many nodes, each with the nodes of the smaller part."""
     found = []
     for edge in dict.fromkeys(edges):
-        parts = components([e for e in edges if e != edge], names)
-        if len(parts) > whole:
-            found.append((edge, min((part for part in parts if set(part) & set(edge)), key=len)))
+        first, second = np.array([e for e in edges if e != edge], dtype=np.int64).reshape(-1, 2).T
+        label = component_labels(first, second, nodes)
+        if label[edge[0]] != label[edge[1]]:
+            parts = (np.flatnonzero(label == label[end]).tolist() for end in edge)
+            found.append((edge, min(parts, key=lambda part: (len(part), part[0]))))
     return found
 
 

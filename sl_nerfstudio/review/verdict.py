@@ -7,6 +7,7 @@ of pixels and of frames, and degrees; no lengths.
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from statistics import median_high
 from typing import Literal
 
 import numpy as np
@@ -429,7 +430,7 @@ def _weak_connections(facts: ScanFacts) -> Iterator[Reason]:
     index = {name: k for k, name in enumerate(names)}
     if len(names) < 3:
         return  # the only pair: nothing could confirm it but the agreement of its coordinates, which is judged
-    for (a, b), part in bridges([(index[a], index[b]) for a, b in used], range(len(names))):
+    for (a, b), part in bridges([(index[a], index[b]) for a, b in used], len(names)):
         yield Reason(
             "acceptable",
             f"only the pair {names[a]} and {names[b]} connects {listed([names[k] for k in part])} to the other frames; "
@@ -476,8 +477,8 @@ def _starting_poses(facts: ScanFacts) -> Iterator[Reason]:
     known = [(f.rays_px / f.stated_px, f) for f in facts.in_scan if f.rays_px is not None and f.stated_px]
     if not known:
         return
-    if _median([excess for excess, _ in known]) > SUSPECT_SIGMAS:
-        rays, stated = (_median([value or 0.0 for value in values]) for values in zip(
+    if median_high([excess for excess, _ in known]) > SUSPECT_SIGMAS:
+        rays, stated = (median_high([value or 0.0 for value in values]) for values in zip(
             *((f.rays_px, f.stated_px) for _, f in known), strict=True
         ))  # fmt: skip
         yield Reason(
@@ -533,14 +534,14 @@ def _contradicting_groups(
         yield Reason(
             "poor",
             f"{listed([names[k] for k in group])}: agree with each other and contradict the other frames: 95 % of the "
-            f"points that both saw lie only within {_median(between):.2g} px (in the whole scan: noise "
+            f"points that both saw lie only within {median_high(between):.2g} px (in the whole scan: noise "
             f"{cross.noise_px:.2g} px)",
             "again",
         )
 
 
 def _frame_sentence(name: str, frame: FrameCrossAgreement, cross: CrossFrameAgreement, band: Band) -> str:
-    usual = _median([f.px_p95 for f in cross.frames if math.isfinite(f.px_p95)])
+    usual = median_high([f.px_p95 for f in cross.frames if math.isfinite(f.px_p95)])
     return (
         f"{name}: {'contradicts' if band == 'poor' else 'agrees less well with'} the frames that saw the same surface: "
         f"{frame.excess:.2g} times the usual residual, {frame.share:.0%} of its points within the noise, 95 % within "
@@ -583,8 +584,3 @@ def _missing(facts: ScanFacts) -> Iterator[Reason]:
 
 def _share_band(count: int, total: int) -> Band:
     return "poor" if count > _MOST_FRAMES * total else "acceptable"
-
-
-def _median(values: Sequence[float]) -> float:
-    ordered = sorted(values)
-    return ordered[len(ordered) // 2] if ordered else math.nan

@@ -11,8 +11,9 @@ from sl_nerfstudio.bundle_adjustment.normal_equations import NormalEquations
 from sl_nerfstudio.bundle_adjustment.parameters import INTRINSICS_SIGMA, PosePrior, by_kind, gauge_directions
 from sl_nerfstudio.bundle_adjustment.residuals import Linearisation, Rig
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_se3, log_so3, pose, transform
+from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_se3, log_so3, transform
 from sl_nerfstudio.geometry.triangulation import pixel_centres, pixel_rays
+from tests import formulas
 
 BALLS = ((0.35, 0.1, 0.0, 0.3), (-0.35, 0.3, -0.05, 0.25), (-0.05, -0.4, -0.1, 0.2))  # x, y, z, radius
 DISK_HEIGHT, DISK_RADIUS = -0.3, 0.9
@@ -29,11 +30,7 @@ def camera_of(size: int) -> Device:
 
 def look_at(eye: tuple[float, float, float]) -> Tensor:
     """Pose of a device at `eye` that looks along its -z at the origin."""
-    back = torch.tensor(eye, dtype=torch.float64)
-    t, back = back, back / back.norm()
-    right = torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), back)
-    right = right / right.norm()
-    return pose(torch.stack([right, torch.linalg.cross(back, right), back], 1), t)
+    return torch.from_numpy(formulas.look_at(eye))
 
 
 def rig_of(frames: int, size: int, projector: str = "pinhole") -> Rig:

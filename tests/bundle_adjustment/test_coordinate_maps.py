@@ -45,32 +45,26 @@ def window_pixels(frame: torch.Tensor, uv: torch.Tensor) -> torch.Tensor:
     return ((at + 4).minimum(size) - (at - 3).clamp_min(0)).prod(-1)
 
 
-def test_a_plane_is_reproduced_exactly_everywhere_with_its_slope():
+@pytest.mark.parametrize("bend", [0.0, 1.0])
+def test_planes_and_paraboloids_are_reproduced_exactly_everywhere_with_their_slopes(bend):
+    curvature = bend * torch.tensor([[0.25, -0.125, 0.0625], [-0.5, 0.25, 0.125]], dtype=torch.float64)  # xx, xy, yy
+
+    def curved(uv: torch.Tensor) -> torch.Tensor:
+        x, y = uv[..., :1], uv[..., 1:]
+        return curvature[:, 0] * x * x + curvature[:, 1] * x * y + curvature[:, 2] * y * y
+
+    images = plane_images()
+    for image, (w, h) in zip(images, SIZES, strict=True):
+        image += curved(pixel_centres(Device(w, h, 1.0, 1.0, 0.0, 0.0), torch.float64)).float()
     frame, uv = positions()
-    found = CoordinateMaps.of(plane_images()).look_up(frame, uv)
-    expected = (SLOPES[frame] @ uv[..., None]).squeeze(-1) + CONSTANTS[frame]
+    found = CoordinateMaps.of(images).look_up(frame, uv)
+    expected = (SLOPES[frame] @ uv[..., None]).squeeze(-1) + CONSTANTS[frame] + curved(uv)
+    x, y = uv[:, 0], uv[:, 1]
+    slopes = torch.stack([torch.stack([2 * a * x + b * y, b * x + 2 * c * y], -1) for a, b, c in curvature], 1)
     enough = window_pixels(frame, uv) >= 24
     assert torch.equal(found.valid, enough) and 0 < int(enough.sum()) < len(uv)
-    assert torch.allclose(found.uv_projector[enough], expected[enough], rtol=0, atol=1e-9)
-    assert torch.allclose(found.jacobian[enough], SLOPES[frame][enough], rtol=0, atol=1e-9)
-
-
-def test_a_paraboloid_is_reproduced_exactly_with_its_slope():
-    bend = torch.tensor([[0.25, -0.125, 0.0625], [-0.5, 0.25, 0.125]], dtype=torch.float64)  # xx, xy, yy
-
-    def value(uv: torch.Tensor) -> torch.Tensor:
-        x, y = uv[..., :1], uv[..., 1:]
-        return bend[:, 0] * x * x + bend[:, 1] * x * y + bend[:, 2] * y * y + uv @ SLOPES[0].T
-
-    image = value(pixel_centres(Device(*SIZES[0], 1.0, 1.0, 0.0, 0.0), torch.float64)).float()
-    image[::3, ::4] = NAN
-    uv = 4 + 12 * torch.rand(200, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    found = CoordinateMaps.of([image]).look_up(torch.zeros(200, dtype=torch.long), uv)
-    x, y = uv[:, 0], uv[:, 1]
-    slopes = [torch.stack([2 * a * x + b * y, b * x + 2 * c * y], -1) for a, b, c in bend]
-    assert found.valid.all()
-    assert torch.allclose(found.uv_projector, value(uv), rtol=0, atol=1e-8)
-    assert torch.allclose(found.jacobian, torch.stack(slopes, 1) + SLOPES[0], rtol=0, atol=1e-8)
+    assert torch.allclose(found.uv_projector[enough], expected[enough], rtol=0, atol=1e-8)
+    assert torch.allclose(found.jacobian[enough], (SLOPES[frame] + slopes)[enough], rtol=0, atol=1e-8)
 
 
 @pytest.mark.parametrize(

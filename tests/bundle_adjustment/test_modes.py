@@ -17,6 +17,7 @@ from sl_nerfstudio.bundle_adjustment.modes import (
     explore,
     farthest_frame,
     is_rough,
+    registered_start,
     shake,
     with_others,
 )
@@ -27,13 +28,13 @@ from sl_nerfstudio.bundle_adjustment.parameters import (
     baseline_scale,
     restore,
 )
-from sl_nerfstudio.bundle_adjustment.registered_start import registered_start
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
 from sl_nerfstudio.bundle_adjustment.search import (
     AdjustmentSettings,
     SearchProblem,
     problem_of,
     search,
+    unplaced_frames,
 )
 from sl_nerfstudio.geometry.lie import exp_se3, inverse, log_se3, log_so3
 
@@ -165,6 +166,16 @@ def test_the_median_frame_decides_what_is_rough():
     assert is_rough(prior, 1.99) and not is_rough(prior, 2.01)
 
 
+@pytest.mark.parametrize(("lost", "empty"), [((), ()), ((2,), ()), ((1, 4), ()), ((), (3,))])
+def test_frames_that_see_too_little_of_what_the_others_agree_on_are_unplaced(true, lost, empty):
+    rig, images = true, images_of(true, SIZE)
+    for frame in lost:
+        rig = turned(rig, frame, 5.0)
+    for frame in empty:
+        images[frame][:] = float("nan")
+    assert unplaced_frames(rig, CoordinateMaps.of(images), 0.1, AdjustmentSettings()) == lost + empty
+
+
 # Registered surfaces: a start that is near the truth however far off the given one is.
 
 _EXACT = 0.5  # degrees: what images of 100 pixels and 100 look-ups of each frame allow
@@ -248,34 +259,25 @@ def other_side(rig: Rig, frames: list[int]) -> Rig:
     return rig.moved(delta, torch.zeros_like(delta))
 
 
-@pytest.mark.parametrize("frames", [[LOST], [1, 2]])
+@pytest.mark.parametrize(("frames", "mark"), [([LOST], ()), ([1, 2], ()), ([LOST], (MARK,))])
 @pytest.mark.parametrize("at_the_result", [False, True])
-def test_an_object_with_two_equal_sides_has_two_modes_of_equal_weight(true, first, frames, at_the_result, monkeypatch):
-    monkeypatch.setattr(analytic, "BALLS", ALIKE)
+def test_an_object_with_two_equal_sides_has_two_modes_unless_a_mark_tells_them_apart(
+    true, first, frames, mark, at_the_result, monkeypatch
+):
+    monkeypatch.setattr(analytic, "BALLS", (*ALIKE, *mark))
     maps = CoordinateMaps.of(images_of(true, SIZE))
     problem = problem_of(true, maps, prior_of(FRAMES, *[1e6] * 4), ASKED)
     rigs = (true, other_side(true, frames))
     best, other = (
-        replace(first, state=replace(first.state, rig=rig), noise=0.1) for rig in rigs[:: 1 - 2 * at_the_result]
+        replace(first, state=replace(first.state, rig=rig), noise=0.1)
+        for rig in (reversed(rigs) if at_the_result and not mark else rigs)
     )
     factor = torch.zeros(12 * FRAMES + UNKNOWNS, 1, dtype=torch.float64)
     found, said = with_others(Explored(problem, "known-rig", best, (other, other)), factor, ())
-    (mode,) = said
-    assert abs(mode.log_odds) < 2 * mode.error < 10 and mode.frames == tuple(frames)
-    assert mode.angle_deg == pytest.approx(180, abs=0.01) and abs(mode.axis[2]) == pytest.approx(1, abs=1e-6)
-    assert torch.equal(found, factor)  # the sigma is that of the result's own mode
-
-
-def test_a_mark_on_one_side_leaves_one_mode(true, first, monkeypatch):
-    monkeypatch.setattr(analytic, "BALLS", (*ALIKE, MARK))
-    maps = CoordinateMaps.of(images_of(true, SIZE))
-    problem = problem_of(true, maps, prior_of(FRAMES, *[1e6] * 4), ASKED)
-    best, other = (
-        replace(first, state=replace(first.state, rig=rig), noise=0.1) for rig in (true, other_side(true, [LOST]))
-    )
-    factor = torch.zeros(12 * FRAMES + UNKNOWNS, 1, dtype=torch.float64)
-    found, said = with_others(Explored(problem, "known-rig", best, (other,)), factor, ())
-    assert said == () and torch.equal(found, factor)
+    assert torch.equal(found, factor) and len(said) == (0 if mark else 1)  # the sigma is that of the result's own mode
+    for mode in said:
+        assert abs(mode.log_odds) < 2 * mode.error < 10 and mode.frames == tuple(frames)
+        assert mode.angle_deg == pytest.approx(180, abs=0.01) and abs(mode.axis[2]) == pytest.approx(1, abs=1e-6)
 
 
 # Increments between rigs.

@@ -13,7 +13,6 @@ from sl_nerfstudio.bundle_adjustment.observations import (
     Kernel,
     away_from_borders,
     frame_medians,
-    narrowed,
     noise_of,
     noise_ratios,
     observe,
@@ -193,19 +192,6 @@ def test_curvature_is_that_of_the_cost_relative_to_its_weights(seed, size, inval
     assert k.curvature(r) == pytest.approx(float(hessian.trace() / 4 / weights.sum()), rel=1e-9, abs=1e-12)
 
 
-def test_a_gross_error_costs_the_same_at_any_width_and_what_cannot_be_seen_has_no_weight():
-    far = Residuals(
-        *(torch.full((n, 2), 1e6, dtype=torch.float64) for n in (4, 5)),
-        torch.ones(5, dtype=torch.bool),
-        torch.zeros(5).double(),
-    )
-    for widths in ((0.5, 2.0, 1.0), (0.5, 0.5, 0.5)):
-        assert kernel(*widths).cost(far, far.cross_valid) == pytest.approx(9 * 0.5**2, rel=1e-6)
-    r = residuals(1, invalid=True)
-    weight = kernel(1.0, 1.0, 1.0).weights(r)[1]
-    assert weight[3] == 0 and (weight[r.cross_valid] > 0).all()
-
-
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=40), st.integers(0, 1000))
 def test_medians_are_of_the_residuals_that_involve_a_frame_also_with_equal_values(values, seed):
     """Each row involves frames 0 and 1, half of them in the other order; frame 2 has none."""
@@ -216,14 +202,6 @@ def test_medians_are_of_the_residuals_that_involve_a_frame_also_with_equal_value
     found = frame_medians(with_roughness(rows, torch.zeros_like(size), valid), torch.stack([turned, 1 - turned]), 3)
     expected = size[valid].median() if valid.any() else torch.tensor(float("inf")).double()
     assert (found[:2] == expected).all() and torch.isinf(found[2])
-
-
-@given(st.floats(0.01, 10.0), st.floats(0.01, 10.0))
-def test_widths_narrow_gradually_and_never_widen(width, target):
-    old, new = (torch.tensor([value], dtype=torch.float64) for value in (width, target))
-    found = float(narrowed(old, new))
-    assert found == pytest.approx(min(width, max(target, width / observations._FASTEST)), rel=1e-12)
-    assert float(narrowed(torch.full_like(old, float("inf")), new)) == pytest.approx(target)
 
 
 def test_the_noise_is_the_robust_sigma_of_the_inliers():

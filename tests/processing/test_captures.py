@@ -52,9 +52,13 @@ def test_images_of_another_size_and_unreadable_ones_are_faults_of_their_frames(t
     _write(tmp_path / "f1.png", 12, 16)
     (tmp_path / "f2.png").write_bytes(b"")
     _write(tmp_path / "f4.png", 32, 24)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("L", (16, 12), 90).save(tmp_path / "f5.jpg", exif=exif)
     captures = find_captures(tmp_path, sequences=False)
-    assert sorted(captures.faults) == ["f1", "f2", "f4"]
-    turned, empty, large = (str(captures.faults[k]) for k in ("f1", "f2", "f4"))
+    assert sorted(captures.faults) == ["f1", "f2", "f4", "f5"]
+    turned, empty, large, tagged = (str(captures.faults[name]) for name in sorted(captures.faults))
+    assert "is 12 x 16 pixels, most images are 16 x 12" in tagged and "as the image's EXIF tag says" in tagged
     assert "f1.png: is 12 x 16 pixels, most images are 16 x 12" in turned and "held on its side" in turned
     assert "f2.png: is empty" in empty
     assert "f4.png: is 32 x 24 pixels" in large and "resized, cropped" in large
@@ -172,16 +176,6 @@ def test_several_cameras_take_turns_each_with_its_own_intrinsics(tmp_path):
     (tmp_path / "c" / "right").rename(tmp_path / "c" / "rechts")
     with pytest.raises(UserError, match="has the folders left, rechts, the intrinsics file the cameras left, right"):
         find_captures(tmp_path / "c", False, camera_names(path))
-
-
-def test_a_photograph_turned_by_its_tag_is_told_from_a_cropped_one(tmp_path):
-    for k in range(3):
-        _write(tmp_path / f"{k}.jpg")
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.new("L", (16, 12), 90).save(tmp_path / "3.jpg", exif=exif)
-    fault = str(find_captures(tmp_path, False).faults["3"])
-    assert "is 12 x 16 pixels, most images are 16 x 12" in fault and "as the image's EXIF tag says" in fault
 
 
 def test_a_video_of_gray_code_is_refused(tmp_path):

@@ -106,10 +106,27 @@ def test_a_file_with_the_projector_alone_needs_photographs_that_state_the_focal_
     require_intrinsics(replace(config, intrinsics=None), projector_needed=False)
 
 
-@pytest.mark.parametrize("more", [{"rig": "rigid"}, {"rig": "static-projector"}, {"estimate_projector": True}])
-def test_what_only_the_adjustment_can_do_cannot_be_asked_for_without_it(ramp_scan, tmp_path, more):
-    with pytest.raises(UserError, match=r"--no-adjust and --(rig|estimate-projector)"):
-        ramp_scan.config(tmp_path / "s", no_adjust=True, **more).check()
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"no_adjust": True, "rig": "rigid"}, "--no-adjust and --rig rigid"),
+        ({"no_adjust": True, "rig": "static-projector"}, "--no-adjust and --rig static-projector"),
+        ({"no_adjust": True, "estimate_projector": True}, "--no-adjust and --estimate-projector"),
+        ({"jobs": 0}, "--jobs 0: give at least 1"),
+        ({"seed": -1}, "--seed -1"),
+        ({"work": "s"}, r"--work .*: is in the output(.|\n)*such as .*scan.work"),
+        ({"work": "s/inside"}, "--work .*: is in the output"),
+        ({"work": "s/../s"}, "--work .*: is in the output"),
+        ({"output": "captures"}, r"--output .*: is in the captures(.|\n)*such as .*/scan$"),
+        ({"output": "captures/scan"}, "--output .*: is in the captures"),
+        ({"work": "captures/work"}, "--work .*: is in the captures"),
+    ],
+)
+def test_flags_that_cannot_be_meant_together(ramp_scan, tmp_path, changes, words):
+    paths = {key: tmp_path / changes[key] for key in ("work", "output") if key in changes}
+    config = replace(ramp_scan.config(tmp_path / "s"), images=tmp_path / "captures", **(changes | paths))
+    with pytest.raises(UserError, match=words):
+        config.check()
 
 
 def test_inputs_are_read_before_anything_is_written(ramps_registered, ramp_scan, tmp_path):

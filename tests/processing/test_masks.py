@@ -119,28 +119,26 @@ def _write(folder, masks):
 UPPER = {name: _mask(slice(0, 75)) for name in NAMES}
 
 
-def test_all_frames_without_a_mask_are_named_at_once(tmp_path):
-    folder = _write(tmp_path / "m", {NAMES[0]: _mask(), "other": _mask()})
-    with pytest.raises(FileError, match=r"has no mask for 3 of 4 frames: a 2, a 3, a 10\n.*name of the frame"):
-        find_masks(folder, dict.fromkeys(NAMES, SIZE))
-
-
-def test_all_masks_that_cannot_be_used_are_named_at_once(tmp_path):
-    folder = _write(tmp_path / "m", UPPER | {NAMES[1]: _mask()[:50], NAMES[3]: np.zeros(SIZE, bool)})
-    with pytest.raises(FileError, match=r"a 2.png: is 130 x 50 pixels.* \(and 1 more cannot be used: a 10.png\)"):
-        find_masks(folder, dict.fromkeys(NAMES, SIZE))
-
-
-def test_folders_that_cannot_be_meant_are_refused(tmp_path):
-    with pytest.raises(FileError, match="is no folder"):
-        find_masks(tmp_path / "nowhere", dict.fromkeys(NAMES, SIZE))
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(FileError, match="holds no masks"):
-        find_masks(tmp_path / "empty", dict.fromkeys(NAMES, SIZE))
-    folder = _write(tmp_path / "m", UPPER)
-    (folder / f"{NAMES[2]}.bmp").write_bytes(b"x")
-    with pytest.raises(FileError, match="holds several masks for a 3"):
-        find_masks(folder, dict.fromkeys(NAMES, SIZE))
+@pytest.mark.parametrize(
+    ("masks", "words"),
+    [
+        (None, "is no folder"),
+        ({}, "holds no masks"),
+        ({NAMES[0]: _mask(), "other": _mask()}, r"has no mask for 3 of 4 frames: a 2, a 3, a 10\n.*name of the frame"),
+        (
+            UPPER | {NAMES[1]: _mask()[:50], NAMES[3]: np.zeros(SIZE, bool)},
+            r"a 2.png: is 130 x 50 pixels.* \(and 1 more cannot be used: a 10.png\)",
+        ),
+        (UPPER, "holds several masks for a 3"),
+    ],
+)
+def test_folders_whose_masks_cannot_be_used_are_refused_with_all_names_at_once(tmp_path, masks, words):
+    if masks is not None:
+        _write(tmp_path / "m", masks)
+    if masks is UPPER:
+        (tmp_path / "m" / f"{NAMES[2]}.bmp").write_bytes(b"x")
+    with pytest.raises(FileError, match=words):
+        find_masks(tmp_path / "m", dict.fromkeys(NAMES, SIZE))
 
 
 def test_a_mask_limits_everything_that_was_decoded(tmp_path):

@@ -79,17 +79,6 @@ def test_the_scan_holds_the_object_and_the_report_shows_what_was_left_out(run):
     assert "object only: left out" in log and "plane with" in log
 
 
-@pytest.mark.slow
-def test_without_the_flag_the_table_stays(on_a_table, ramps_registered, tmp_path):
-    captures, truth = on_a_table
-    result = process(captures.config(tmp_path / "s", no_adjust=True), render_processing_report, lambda _: None)
-    assert result.object_only is None
-    assert json.loads((tmp_path / "s" / "processing.json").read_text())["object_only"] is None
-    frame = read_scan(tmp_path / "s").frames[0]
-    assert (frame.read_mask() & ~truth[frame.name]).sum() > 500
-    assert "left out around" not in (tmp_path / "s" / "processing.html").read_text()
-
-
 def test_a_frame_that_shows_nothing_of_the_object_is_left_out_by_name(run, object_only):
     result = run[0]
     records = tuple(replace(result.frames[0], name=name) for name in "ab")

@@ -70,12 +70,11 @@ def calibrated_before(ramp_scan, whole, tmp_path):
 
 @pytest.fixture
 def lose(monkeypatch):
-    """Makes registration leave out frames, for good unless they may come `back` after the adjustment."""
+    """Makes registration leave out frames, which are not placed after the adjustment either."""
 
-    def lose(*names, back=False):
+    def lose(*names):
         real = stages.register
-        if not back:
-            monkeypatch.setattr(consistency, "include_left_out", lambda clouds, registration, *_: registration)
+        monkeypatch.setattr(consistency, "include_left_out", lambda clouds, registration, *_: registration)
         monkeypatch.setattr(stages, "register", lambda *args: _without(real(*args), names))
 
     return lose
@@ -89,7 +88,13 @@ def test_every_stage_is_logged_and_the_poses_are_right(ramp_scan, whole):
     assert check_scan(root / "s") == []
     assert (root / "s" / "processing.html").read_text() == "4 of 4"
     assert json.loads((root / "s" / "processing.json").read_text()) == json.loads(json.dumps(result.document()))
-    found, true = read_scan(root / "s").poses.T_world_camera, ramp_scan.T_world_camera
+    scan, true = read_scan(root / "s"), ramp_scan.T_world_camera
+    assert [frame.name for frame in scan.frames] == list(NAMES) and result.document()["decoder"] == "ramps"
+    np.testing.assert_allclose(scan.read_pattern(), LAYOUT.render(), atol=0.6 / 255)
+    for frame, exact in zip(scan.frames, ramp_scan.coords, strict=True):
+        off = np.abs(frame.read_coords() - exact)
+        assert np.nanmax(off) < 800 / 65535 and np.isfinite(off).sum() > 0.99 * np.isfinite(exact).sum()
+    found = scan.poses.T_world_camera
     _, degrees, off = pose_errors(found, true)
     assert off.max() < 1e-3 * np.linalg.norm(true[:, :3, 3], axis=1).mean() and degrees.max() < 0.3
 
@@ -125,18 +130,6 @@ def test_frames_that_do_not_register_are_left_out_of_the_scan(lose, ramp_scan, t
     assert result.frames[3].reason == ALONE
     assert f"{NAMES[3]}: capture it again; it was left out ({result.frames[3].reason})" in result.recapture
     assert (tmp_path / "s" / "processing.html").read_text() == "3 of 4"
-
-
-@pytest.mark.slow
-def test_a_frame_that_registration_left_out_is_placed_after_the_adjustment(lose, ramp_scan, tmp_path):
-    lose(NAMES[3], back=True)
-    result, log = _run(ramp_scan.config(tmp_path / "s"))
-    assert "registered 3 of 4 frames" in log
-    assert f"placed against the adjusted frames: {NAMES[3]}; adjusting again with them" in log
-    assert [frame.name for frame in read_scan(tmp_path / "s").frames] == list(NAMES)
-    assert all(frame.in_scan for frame in result.frames) and result.recapture == ()
-    found, true = read_scan(tmp_path / "s").poses.T_world_camera, ramp_scan.T_world_camera
-    assert pose_errors(found, true)[2].max() < 2e-3 * np.linalg.norm(true[:, :3, 3], axis=1).mean()
 
 
 def test_fewer_than_two_registered_frames_are_an_error_with_a_report(lose, ramp_scan, tmp_path):
@@ -179,17 +172,6 @@ def test_given_poses_of_frames_that_cannot_be_decoded_do_not_count(copy, tmp_pat
     assert f"{NAMES[1]}: registered" in said
 
 
-def test_given_poses_at_one_place_have_no_unit(ramp_scan, tmp_path):
-    """Which is said before anything is decoded."""
-    turned = ramp_scan.T_world_camera.copy()
-    turned[:, :3, 3] = (1, 2, 3)
-    rough = _poses(tmp_path, dict(zip(NAMES, turned, strict=True)))
-    config, log = ramp_scan.config(tmp_path / "s", poses=rough), []
-    with pytest.raises(UserError, match=r"has all captures at the same place\n.*cause:  the file holds rotations only"):
-        process(config, lambda *_: "", log.append)
-    assert log == []
-
-
 def test_other_places_of_frames_that_are_left_out_give_no_unit(ramp_scan, tmp_path, monkeypatch):
     T = ramp_scan.T_world_camera.copy()
     T[:3, :3, 3] = (1, 2, 3)
@@ -202,25 +184,24 @@ def test_other_places_of_frames_that_are_left_out_give_no_unit(ramp_scan, tmp_pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("units", ["mm", "arbitrary"])
-def test_given_poses_give_axes_and_unit(ramp_scan, tmp_path, units):
+@pytest.mark.parametrize(
+    ("units", "length", "unit", "source"),
+    [
+        ("mm", None, "mm", "given camera poses"),
+        ("arbitrary", None, "arbitrary", ""),
+        ("mm", "baseline of frame 2 = 5 cm", "cm", f"baseline of frame {NAMES[2]}"),
+    ],
+)
+def test_given_poses_give_axes_and_unit_unless_a_length_is_known(ramp_scan, tmp_path, units, length, unit, source):
     rough = _poses(tmp_path, dict(zip(NAMES[:3], ramp_scan.T_world_camera[:3], strict=True)), units)
-    result, _ = _run(ramp_scan.config(tmp_path / "s", poses=rough))
+    result, _ = _run(ramp_scan.config(tmp_path / "s", poses=rough, known_length=length))
     scan = read_scan(tmp_path / "s")
-    np.testing.assert_allclose(scan.poses.T_world_camera, ramp_scan.T_world_camera, atol=1.0)  # mm, at 960 mm
-    assert scan.units == result.units == units
-    source = "given camera poses" if units == "mm" else ""
-    assert (scan.scale.known, result.scale_source) == (units == "mm", source)
-
-
-@pytest.mark.slow
-def test_a_known_length_overrules_the_unit_of_given_poses(ramp_scan, tmp_path):
-    rough = _poses(tmp_path, dict(zip(NAMES, ramp_scan.T_world_camera, strict=True)))
-    _run(ramp_scan.config(tmp_path / "s", poses=rough, known_length="baseline of frame 2 = 5 cm"))
-    scan = read_scan(tmp_path / "s")
-    baseline = scan.poses.baseline[2]
-    assert (scan.units, scan.scale.source) == ("cm", f"baseline of frame {NAMES[2]}")
-    assert baseline == pytest.approx(5, rel=1e-5)
+    assert scan.units == result.units == unit
+    assert scan.scale.known == bool(source) and result.scale_source == source
+    if length is None:
+        np.testing.assert_allclose(scan.poses.T_world_camera, ramp_scan.T_world_camera, atol=1.0)  # mm, at 960 mm
+    else:
+        assert scan.scale.source == source and scan.poses.baseline[2] == pytest.approx(5, rel=1e-5)
 
 
 def test_a_known_length_in_a_frame_that_failed_is_an_error_before_registration(monkeypatch, copy, tmp_path):
