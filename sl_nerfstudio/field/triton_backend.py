@@ -297,7 +297,7 @@ class _Kept:
 
 
 class TritonField:
-    """`MergedBackend` for float32 with 8 features per level."""
+    """`FieldBackend` for float32 with 8 features per level."""
 
     def __init__(self, layout: GridLayout, knee: float):
         self.layout = layout
@@ -305,7 +305,7 @@ class TritonField:
         self._width = 8 + FEATURES * layout.levels
 
     def evaluate_all(self, state: FieldState, p: Float[Tensor, "n 3"], first: int) -> tuple[Tensor, Tensor, _Kept]:
-        """See `MergedBackend`."""
+        """See `FieldBackend`."""
         n, k = len(p), len(p) - first
         weights, biases = _layers(state)
         *lower, last = range(len(weights) - 1)
@@ -330,15 +330,9 @@ class TritonField:
         return f, gradient, _Kept(p.detach(), first, encoded, inputs, z, d, h)
 
     def pull_back_all(
-        self,
-        state: FieldState,
-        kept: _Kept,
-        g: Float[Tensor, "n"],
-        v: Float[Tensor, "k 3"],
-        points: bool,
-        to: Target,
+        self, state: FieldState, kept: _Kept, g: Float[Tensor, "n"], v: Float[Tensor, "k 3"], points: bool, to: Target
     ) -> Pulled:
-        """See `MergedBackend`."""
+        """See `FieldBackend`."""
         p, first, n, k, z = kept.p, kept.first, len(kept.p), len(kept.p) - kept.first, kept.z
         weights, _ = _layers(state)
         last = len(z) - 1
