@@ -171,6 +171,7 @@ class FieldBackend(Protocol):
         self, state: FieldState, p: Float[Tensor, "n 3"], first: int
     ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"], Any]:
         """Values, gradients of the points from `first` on, and what the pull-back needs."""
+        ...
 
     def pull_back_all(
         self, state: FieldState, kept: Any, g: Float[Tensor, "n"], v: Float[Tensor, "k 3"], points: bool, to: Target
@@ -180,6 +181,7 @@ class FieldBackend(Protocol):
         Those of the other points are 0. The table's gradient is added to `to.table`, and the rows written to are marked
         in `to.marks`.
         """
+        ...
 
 
 class SeparateBackend(ABC):
