@@ -5,9 +5,9 @@ import pytest
 
 from sl_nerfstudio.decoding.grid_graph import STEPS, neighbourhoods
 from sl_nerfstudio.pattern.codes import rotate_codes
-from training.captures import random_capture
 from training.graphs import Damage, damage_graph
 from training.patterns import PatternStock
+from training.unet import random_capture
 
 
 @pytest.fixture(scope="module")
