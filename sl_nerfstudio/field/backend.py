@@ -130,26 +130,19 @@ class FieldState:
 
     table: Float[Tensor, "rows f"]
     level_weights: Float[Tensor, "levels"]
-    mlp: tuple[Tensor, ...]
-    """Weight and bias of each layer, input to output."""
-    places: Int32[Tensor, "levels 3"]
-    """Where the levels are in the table, see `HashGrid`."""
-    active: tuple[int, ...]
-    """Levels whose weight is not 0; known to the host, which need not wait for a GPU."""
+    mlp: tuple[Tensor, ...]  # weight and bias of each layer, input to output
+    places: Int32[Tensor, "levels 3"]  # where the levels are in the table, see `HashGrid`
+    active: tuple[int, ...]  # levels whose weight is not 0; known to the host, which need not wait for a GPU
 
 
 @dataclass(frozen=True)
 class Target:
     """Which gradients of parameters a pull-back makes, and where it adds that of the table."""
 
-    parameters: bool
-    """Whether any parameter's gradient is needed."""
-    table: Float[Tensor, "rows f"] | None
-    """What the table's gradient is added to."""
-    marks: UInt8[Tensor, "marks"] | None
-    """Marks of the table's rows, if it is the persistent buffer."""
-    returned: Float[Tensor, "rows f"] | None
-    """The table's gradient, if the backward function returns it."""
+    parameters: bool  # whether any parameter's gradient is needed
+    table: Float[Tensor, "rows f"] | None  # what the table's gradient is added to
+    marks: UInt8[Tensor, "marks"] | None  # marks of the table's rows, if it is the persistent buffer
+    returned: Float[Tensor, "rows f"] | None  # the table's gradient, if the backward function returns it
 
 
 @dataclass(frozen=True)

@@ -47,41 +47,26 @@ class Network(NamedTuple):
     depth: int
     hidden: int
     layers: int
-    used: int
-    """Columns of the encoded point up to the last level that is switched on."""
-    knee: np.float32
-    """Half-width of the rounded corner of the activation."""
+    used: int  # columns of the encoded point up to the last level that is switched on
+    knee: np.float32  # half-width of the rounded corner of the activation
 
 
 class Scratch(NamedTuple):
     """Buffers of one thread for one chunk; [POINTS, width] each; those of the layers are stacked."""
 
-    e: ndarray
-    """Encoded points."""
-    jac: ndarray
-    """Their derivatives with respect to the points."""
-    a: ndarray
-    """Activations of each layer."""
-    t: ndarray
-    """Their position on the activation's corner, 0 .. 1; see `activate`."""
-    u: ndarray
-    """Derivative of f with respect to each layer's pre-activations."""
-    h: ndarray
-    """The same with respect to each layer's activations."""
-    z_dot: ndarray
-    """Directional derivative of each layer's pre-activations."""
-    a_dot: ndarray
-    """The same of each layer's activations."""
-    e_dot: ndarray
-    """The same of the encoded points."""
-    d: ndarray
-    """Adjoint of the current layer's pre-activations."""
-    d2: ndarray
-    """The same of the layer before it."""
-    de: ndarray
-    """Adjoint of the encoded points."""
-    ue: ndarray
-    """Derivative of f with respect to the encoded points."""
+    e: ndarray  # encoded points
+    jac: ndarray  # their derivatives with respect to the points
+    a: ndarray  # activations of each layer
+    t: ndarray  # their position on the activation's corner, 0 .. 1; see `activate`
+    u: ndarray  # derivative of f with respect to each layer's pre-activations
+    h: ndarray  # the same with respect to each layer's activations
+    z_dot: ndarray  # directional derivative of each layer's pre-activations
+    a_dot: ndarray  # the same of each layer's activations
+    e_dot: ndarray  # the same of the encoded points
+    d: ndarray  # adjoint of the current layer's pre-activations
+    d2: ndarray  # the same of the layer before it
+    de: ndarray  # adjoint of the encoded points
+    ue: ndarray  # derivative of f with respect to the encoded points
 
 
 @part

@@ -286,14 +286,10 @@ class _Kept:
     p: Float[Tensor, "n 3"]
     first: int
     encoded: Float[Tensor, "n+k width"]
-    inputs: list[Tensor]
-    """What hidden layers take: encoded points, then activations [n + k, h]."""
-    z: list[Tensor]
-    """Pre-activations [n, h] of the hidden layers."""
-    d: list[Tensor]
-    """Derivatives of the field by them, in the last k of n + k rows; the pull-back fills the others."""
-    h: list[Tensor]
-    """Derivatives of the field by the activations [k, h] of all hidden layers but the last."""
+    inputs: list[Tensor]  # what hidden layers take: encoded points, then activations [n + k, h]
+    z: list[Tensor]  # pre-activations [n, h] of the hidden layers
+    d: list[Tensor]  # derivatives of the field by them, in the last k of n + k rows; the pull-back fills the others
+    h: list[Tensor]  # derivatives of the field by the activations [k, h] of all hidden layers but the last
 
 
 class TritonField:
