@@ -1,9 +1,10 @@
 """The interface of an implementation of the field, and what the compiled one supports.
 
 An implementation evaluates the field inside and outside its box and pulls gradients back. It does not use autograd: the
-functions at the end make torch operations from it.
+function at the end makes a torch operation from it.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import Enum, auto
 from functools import partial
@@ -129,26 +130,19 @@ class FieldState:
 
     table: Float[Tensor, "rows f"]
     level_weights: Float[Tensor, "levels"]
-    mlp: tuple[Tensor, ...]
-    """Weight and bias of each layer, input to output."""
-    places: Int32[Tensor, "levels 3"]
-    """Where the levels are in the table, see `HashGrid`."""
-    active: tuple[int, ...]
-    """Levels whose weight is not 0; known to the host, which need not wait for a GPU."""
+    mlp: tuple[Tensor, ...]  # weight and bias of each layer, input to output
+    places: Int32[Tensor, "levels 3"]  # where the levels are in the table, see `HashGrid`
+    active: tuple[int, ...]  # levels whose weight is not 0; known to the host, which need not wait for a GPU
 
 
 @dataclass(frozen=True)
 class Target:
     """Which gradients of parameters a pull-back makes, and where it adds that of the table."""
 
-    parameters: bool
-    """Whether any parameter's gradient is needed."""
-    table: Float[Tensor, "rows f"] | None
-    """What the table's gradient is added to."""
-    marks: UInt8[Tensor, "marks"] | None
-    """Marks of the table's rows, if it is the persistent buffer."""
-    returned: Float[Tensor, "rows f"] | None
-    """The table's gradient, if the backward function returns it."""
+    parameters: bool  # whether any parameter's gradient is needed
+    table: Float[Tensor, "rows f"] | None  # what the table's gradient is added to
+    marks: UInt8[Tensor, "marks"] | None  # marks of the table's rows, if it is the persistent buffer
+    returned: Float[Tensor, "rows f"] | None  # the table's gradient, if the backward function returns it
 
 
 @dataclass(frozen=True)
@@ -161,45 +155,9 @@ class Pulled:
 
 @runtime_checkable
 class FieldBackend(Protocol):
-    """An implementation of the field for one layout and activation."""
+    """An implementation of the field for one layout and activation: values of all points, gradients of the last ones.
 
-    def evaluate(
-        self, state: FieldState, p: Float[Tensor, "n 3"], gradient: bool
-    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"] | None]:
-        """Values at points, and their gradients on request."""
-        ...
-
-    def pull_back(
-        self,
-        state: FieldState,
-        p: Float[Tensor, "n 3"],
-        g: Float[Tensor, "n"],
-        points: bool,
-        to: Target,
-    ) -> Pulled:
-        """Gradients of `sum g f(p)` with respect to the points and to the parameters, on request.
-
-        The table's gradient is added to `to.table`, and the rows written to are marked in `to.marks`.
-        """
-        ...
-
-    def pull_back_gradient(
-        self,
-        state: FieldState,
-        p: Float[Tensor, "n 3"],
-        g: Float[Tensor, "n"],
-        v: Float[Tensor, "n 3"],
-        to: Target,
-    ) -> tuple[Tensor, ...]:
-        """MLP gradients of `sum g f(p) + v . grad f(p)`; the table's as in `pull_back`."""
-        ...
-
-
-@runtime_checkable
-class MergedBackend(Protocol):
-    """An implementation that evaluates all points together: values of all, gradients of those from `first` on.
-
-    Below, n is the number of points and k = n - first.
+    Below, n is the number of points, and k = n - first that of those from `first` on.
     """
 
     def evaluate_all(
@@ -209,19 +167,70 @@ class MergedBackend(Protocol):
         ...
 
     def pull_back_all(
+        self, state: FieldState, kept: Any, g: Float[Tensor, "n"], v: Float[Tensor, "k 3"], points: bool, to: Target
+    ) -> Pulled:
+        """Gradients of `sum g f + v . grad f`, on request: by the points before `first`, and by the parameters.
+
+        Those of the other points are 0. The table's gradient is added to `to.table`, and the rows written to are marked
+        in `to.marks`.
+        """
+        ...
+
+
+class SeparateBackend(ABC):
+    """A `FieldBackend` that evaluates points without gradients apart from those with."""
+
+    @abstractmethod
+    def evaluate(
+        self, state: FieldState, p: Float[Tensor, "n 3"], gradient: bool
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"] | None]:
+        """Values at points, and their gradients on request."""
+
+    @abstractmethod
+    def pull_back(
+        self, state: FieldState, p: Float[Tensor, "n 3"], g: Float[Tensor, "n"], points: bool, to: Target
+    ) -> Pulled:
+        """Gradients of `sum g f(p)` with respect to the points and to the parameters, on request."""
+
+    @abstractmethod
+    def pull_back_gradient(
+        self, state: FieldState, p: Float[Tensor, "n 3"], g: Float[Tensor, "n"], v: Float[Tensor, "n 3"], to: Target
+    ) -> tuple[Tensor, ...]:
+        """MLP gradients of `sum g f(p) + v . grad f(p)`; the table's as in `FieldBackend`."""
+
+    def evaluate_all(
+        self, state: FieldState, p: Float[Tensor, "n 3"], first: int
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"], Float[Tensor, "n 3"]]:
+        """See `FieldBackend`."""
+        values = [self.evaluate(state, p[:first], False)[0]] if first else []
+        gradient = p.new_empty(0, 3)
+        if not first or first < len(p):
+            f, found = self.evaluate(state, p[first:], True)
+            values.append(f)
+            gradient = gradient if found is None else found
+        return values[0] if len(values) == 1 else torch.cat(values), gradient, p.detach()
+
+    def pull_back_all(
         self,
         state: FieldState,
-        kept: Any,
+        kept: Float[Tensor, "n 3"],
         g: Float[Tensor, "n"],
         v: Float[Tensor, "k 3"],
         points: bool,
         to: Target,
     ) -> Pulled:
-        """Gradients of `sum g f + v . grad f`, on request: by the points before `first`, and by the parameters.
-
-        Those of the other points are 0; the table's as in `FieldBackend`.
-        """
-        ...
+        """See `FieldBackend`."""
+        first = len(kept) - len(v)
+        before = Pulled(kept[:0] if points else None, None)
+        if first:
+            before = self.pull_back(state, kept[:first], g[:first], points, to)
+        by_points = None if before.points is None else torch.cat([before.points, torch.zeros_like(v)])
+        if not to.parameters or (first and not len(v)):
+            return Pulled(by_points, before.mlp)
+        by_mlp = self.pull_back_gradient(state, kept[first:], g[first:], v, to)
+        if before.mlp is not None:
+            by_mlp = tuple(a + b for a, b in zip(before.mlp, by_mlp, strict=True))
+        return Pulled(by_points, by_mlp)
 
 
 def numba_cannot(table: Tensor) -> str | None:
@@ -242,7 +251,7 @@ def triton_cannot(table: Tensor) -> str | None:
     return obstacle(table.device)
 
 
-# The field as torch operations: values, and values with gradients, both differentiable once.
+# The field as a torch operation, differentiable once.
 
 
 def _target(ctx: Any) -> Target:
@@ -257,125 +266,45 @@ def _target(ctx: Any) -> Target:
     return Target(True, fresh, None, fresh)
 
 
-Active = tuple[int, ...]  # numbers of the levels that are switched on
-
-
-def _keep(
-    ctx: Any, backend: FieldBackend, buffer: TableGradient | None, active: Active, tensors: tuple[Tensor, ...]
-) -> FieldState:
-    p, places, level_weights, table, *mlp = tensors
-    ctx.backend, ctx.buffer, ctx.parameters, ctx.active = backend, buffer, (table, *mlp), active
-    ctx.save_for_backward(p, places, level_weights.clone(), table, *mlp)  # torch checks that none changes meanwhile
-    return FieldState(table, level_weights, tuple(mlp), places, active)
-
-
-def _kept(ctx: Any) -> tuple[Tensor, FieldState]:
-    p, places, level_weights, table, *mlp = ctx.saved_tensors
-    return p, FieldState(table, level_weights, tuple(mlp), places, ctx.active)
-
-
-class _Value(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, backend: FieldBackend, buffer: TableGradient | None, active: Active, *tensors: Tensor
-    ) -> Tensor:
-        return backend.evaluate(_keep(ctx, backend, buffer, active, tensors), tensors[0], False)[0]
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
-        p, state = _kept(ctx)
-        to = _target(ctx)
-        result = ctx.backend.pull_back(state, p, grad_outputs[0], ctx.needs_input_grad[3], to)
-        return (None, None, None, result.points, None, None, to.returned, *(result.mlp or [None] * len(state.mlp)))
-
-
-class _ValueAndGradient(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, backend: FieldBackend, buffer: TableGradient | None, active: Active, *tensors: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        f, n = backend.evaluate(_keep(ctx, backend, buffer, active, tensors), tensors[0], True)
-        assert n is not None
-        return f, n
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
-        p, state = _kept(ctx)
-        to = _target(ctx)
-        mlp: tuple[Tensor | None, ...] = (None,) * len(state.mlp)
-        if to.parameters:
-            mlp = ctx.backend.pull_back_gradient(state, p, *grad_outputs, to)
-        return (None, None, None, None, None, None, to.returned, *mlp)
-
-
-class _Merged(torch.autograd.Function):
-    """Values at points, and gradients at those from `first` on, by a backend that evaluates them together."""
+class _Evaluated(torch.autograd.Function):
+    """Values at points, and gradients at those from `first` on."""
 
     @staticmethod
     def forward(
-        ctx: Any, backend: MergedBackend, buffer: TableGradient | None, active: Active, first: int, *tensors: Tensor
+        ctx: Any,
+        backend: FieldBackend,
+        buffer: TableGradient | None,
+        active: tuple[int, ...],
+        first: int,
+        *tensors: Tensor,
     ) -> tuple[Tensor, Tensor]:
         p, places, level_weights, table, *mlp = tensors
         ctx.backend, ctx.buffer, ctx.parameters, ctx.active = backend, buffer, (table, *mlp), active
         state = FieldState(table, level_weights, tuple(mlp), places, active)
         f, gradient, ctx.kept = backend.evaluate_all(state, p, first)
-        ctx.save_for_backward(p, places, level_weights, table, *mlp)
+        ctx.save_for_backward(*tensors)  # torch checks that none changes meanwhile
         return f, gradient
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grad_outputs: Tensor) -> Any:
-        _, state = _kept(ctx)
+        _, places, level_weights, table, *mlp = ctx.saved_tensors
         to = _target(ctx)
         g, v = (x.contiguous() for x in grad_outputs)
+        state = FieldState(table, level_weights, tuple(mlp), places, ctx.active)
         result = ctx.backend.pull_back_all(state, ctx.kept, g, v, ctx.needs_input_grad[4], to)
-        mlp = result.mlp or [None] * len(state.mlp)
-        return (None, None, None, None, result.points, None, None, to.returned, *mlp)
+        return (None, None, None, None, result.points, None, None, to.returned, *(result.mlp or [None] * len(mlp)))
 
 
-def value(
-    backend: FieldBackend | MergedBackend, buffer: TableGradient | None, state: FieldState, p: Float[Tensor, "n 3"]
-) -> Float[Tensor, "n"]:
-    """Values at `p`, differentiable with respect to parameters and points.
-
-    If there is a `buffer`, it is or becomes the table's `.grad`, and `backward()` adds to it.
-    """
-    if isinstance(backend, MergedBackend):
-        return _apply(_Merged, backend, buffer, state, p, len(p))[0]
-    return _apply(_Value, backend, buffer, state, p)
-
-
-def value_and_gradient(
-    backend: FieldBackend | MergedBackend, buffer: TableGradient | None, state: FieldState, p: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
-    """Values and gradients at `p`, both differentiable with respect to the parameters; `p` is a constant."""
-    if isinstance(backend, MergedBackend):
-        return _apply(_Merged, backend, buffer, state, p.detach(), 0)
-    return _apply(_ValueAndGradient, backend, buffer, state, p.detach())
-
-
-def value_and_last_gradients(
-    backend: FieldBackend | MergedBackend,
-    buffer: TableGradient | None,
-    state: FieldState,
-    p: Float[Tensor, "n 3"],
-    first: int,
+def evaluated(
+    backend: FieldBackend, buffer: TableGradient | None, state: FieldState, p: Float[Tensor, "n 3"], first: int
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "k 3"]]:
-    """`value` at all points, and gradients at the k points from `first` on, which are constants.
+    """Values at all points, and gradients at the k points from `first` on, which are constants.
 
-    Together, if the backend can, which saves launches on a GPU.
+    Differentiable by the parameters, in their precision, even if mixed precision is switched on; the values also by the
+    points before `first`. If there is a `buffer`, it is or becomes the table's `.grad`, and `backward()` adds to it.
     """
-    if isinstance(backend, MergedBackend):
-        return _apply(_Merged, backend, buffer, state, p, first)
-    f, gradient = value_and_gradient(backend, buffer, state, p[first:])
-    return torch.cat([value(backend, buffer, state, p[:first]), f]), gradient
-
-
-def _apply(function: Any, backend: Any, buffer: TableGradient | None, state: FieldState, p: Tensor, *first: int) -> Any:
-    """Call an autograd function in the parameters' precision, even if mixed precision is switched on."""
     with torch.autocast(p.device.type, enabled=False):
         p = p.to(state.table.dtype).contiguous()
         tensors = (p, state.places, state.level_weights, state.table, *state.mlp)
-        return function.apply(backend, buffer, state.active, *first, *tensors)
+        return _Evaluated.apply(backend, buffer, state.active, first, *tensors)

@@ -20,13 +20,10 @@ from sl_nerfstudio.field.backend import (
     BackendName,
     FieldBackend,
     FieldState,
-    MergedBackend,
     TableGradient,
+    evaluated,
     numba_cannot,
     triton_cannot,
-    value,
-    value_and_gradient,
-    value_and_last_gradients,
 )
 from sl_nerfstudio.field.hash_grid import GridLayout, HashGrid, SignedDistance
 from sl_nerfstudio.field.torch_backend import TorchField, knee
@@ -122,7 +119,7 @@ class SDFField(nn.Module):
         self.encoding = HashGrid(layout)
         widths = [3 + layout.width] + [config.hidden] * HIDDEN_LAYERS + [1]
         self.mlp = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(widths))
-        self._backends: dict[str, FieldBackend | MergedBackend] = {"torch": TorchField(layout, KNEE)}
+        self._backends: dict[str, FieldBackend] = {"torch": TorchField(layout, KNEE)}
         self._start_as_sphere(SPHERE_RADIUS)
 
     def _start_as_sphere(self, radius: float) -> None:
@@ -163,7 +160,7 @@ class SDFField(nn.Module):
 
     def sdf(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
         """Signed distance; differentiable (once) with respect to the parameters and `p`."""
-        return value(*self._parts(), p)
+        return self.sdf_and_last_gradients(p, len(p))[0]
 
     def forward_geonetwork(self, p: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1"]:
         """`sdf` as a column, under the name that `ns-export marching-cubes` uses."""
@@ -171,7 +168,7 @@ class SDFField(nn.Module):
 
     def sdf_and_gradient(self, p: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"]]:
         """Signed distance and its gradient, both differentiable with respect to the parameters; `p` is a constant."""
-        return value_and_gradient(*self._parts(), p)
+        return self.sdf_and_last_gradients(p.detach(), 0)
 
     def sdf_and_last_gradients(
         self, p: Float[Tensor, "n 3"], first: int
@@ -180,7 +177,7 @@ class SDFField(nn.Module):
 
         On a GPU this takes half the launches of `sdf` and `sdf_and_gradient`.
         """
-        return value_and_last_gradients(*self._parts(), p, first)
+        return evaluated(*self._parts(), p, first)
 
     def obstacle(self, backend: Literal["numba", "triton"]) -> str | None:
         """Why a compiled backend cannot serve the field where it is, or None if it can."""
@@ -202,7 +199,7 @@ class SDFField(nn.Module):
             return "torch"
         raise UserError(f"{obstacle}; choose the backend auto or torch")
 
-    def _parts(self) -> tuple[FieldBackend | MergedBackend, TableGradient | None, FieldState]:
+    def _parts(self) -> tuple[FieldBackend, TableGradient | None, FieldState]:
         """What evaluates the field, what it needs, and the table's persistent gradient buffer.
 
         There is a buffer if there will be a gradient, and compiled kernels write to it.
@@ -216,7 +213,7 @@ class SDFField(nn.Module):
         return self._backends[name], buffer, state
 
 
-def _compiled(name: str, layout: GridLayout) -> FieldBackend | MergedBackend:
+def _compiled(name: str, layout: GridLayout) -> FieldBackend:
     """A compiled backend; numba and Triton, which take a second to import, are imported only when needed."""
     if name == "numba":
         from sl_nerfstudio.field.numba_backend import NumbaField

@@ -38,14 +38,10 @@ PRIMES = (1, 2654435761, 805459861)  # of the spatial hash; the first is 1, so n
 class GridLayout:
     """Where the levels of a feature grid are in the table."""
 
-    resolutions: tuple[int, ...]
-    """Cells per axis of each level."""
-    offsets: tuple[int, ...]
-    """First row of each level in the table."""
-    sizes: tuple[int, ...]
-    """Rows of each level: at least as many as its corners, unless it is hashed."""
-    hashed: tuple[bool, ...]
-    """Whether rows are found by hashing (the size is then a power of two) instead of dense indexing."""
+    resolutions: tuple[int, ...]  # cells per axis of each level
+    offsets: tuple[int, ...]  # first row of each level in the table
+    sizes: tuple[int, ...]  # rows of each level: at least as many as its corners, unless it is hashed
+    hashed: tuple[bool, ...]  # whether rows are found by hashing (the size is then a power of two), not densely
 
     @staticmethod
     def build(levels: int, min_resolution: int, max_resolution: int, log2_table_size: int) -> "GridLayout":

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.field.backend import FieldState, Pulled, Target
+from sl_nerfstudio.field.backend import FieldState, Pulled, SeparateBackend, Target
 from sl_nerfstudio.field.hash_grid import FEATURES, GridLayout
 from sl_nerfstudio.field.numba_grid import FIRST, POINTS, GridArrays, clamped, encode, inside, scatter_level
 from sl_nerfstudio.field.simd import contract, kernel, multiply, part
@@ -47,41 +47,26 @@ class Network(NamedTuple):
     depth: int
     hidden: int
     layers: int
-    used: int
-    """Columns of the encoded point up to the last level that is switched on."""
-    knee: np.float32
-    """Half-width of the rounded corner of the activation."""
+    used: int  # columns of the encoded point up to the last level that is switched on
+    knee: np.float32  # half-width of the rounded corner of the activation
 
 
 class Scratch(NamedTuple):
     """Buffers of one thread for one chunk; [POINTS, width] each; those of the layers are stacked."""
 
-    e: ndarray
-    """Encoded points."""
-    jac: ndarray
-    """Their derivatives with respect to the points."""
-    a: ndarray
-    """Activations of each layer."""
-    t: ndarray
-    """Their position on the activation's corner, 0 .. 1; see `activate`."""
-    u: ndarray
-    """Derivative of f with respect to each layer's pre-activations."""
-    h: ndarray
-    """The same with respect to each layer's activations."""
-    z_dot: ndarray
-    """Directional derivative of each layer's pre-activations."""
-    a_dot: ndarray
-    """The same of each layer's activations."""
-    e_dot: ndarray
-    """The same of the encoded points."""
-    d: ndarray
-    """Adjoint of the current layer's pre-activations."""
-    d2: ndarray
-    """The same of the layer before it."""
-    de: ndarray
-    """Adjoint of the encoded points."""
-    ue: ndarray
-    """Derivative of f with respect to the encoded points."""
+    e: ndarray  # encoded points
+    jac: ndarray  # their derivatives with respect to the points
+    a: ndarray  # activations of each layer
+    t: ndarray  # their position on the activation's corner, 0 .. 1; see `activate`
+    u: ndarray  # derivative of f with respect to each layer's pre-activations
+    h: ndarray  # the same with respect to each layer's activations
+    z_dot: ndarray  # directional derivative of each layer's pre-activations
+    a_dot: ndarray  # the same of each layer's activations
+    e_dot: ndarray  # the same of the encoded points
+    d: ndarray  # adjoint of the current layer's pre-activations
+    d2: ndarray  # the same of the layer before it
+    de: ndarray  # adjoint of the encoded points
+    ue: ndarray  # derivative of f with respect to the encoded points
 
 
 @part
@@ -430,8 +415,8 @@ _BATCH = 16384  # points whose feature gradients are kept (in cache) between the
 _buffers = local()
 
 
-class NumbaField:
-    """`FieldBackend` for float32 on the CPU with 8 features per level."""
+class NumbaField(SeparateBackend):
+    """The field for float32 on the CPU with 8 features per level."""
 
     def __init__(self, layout: GridLayout, knee: float):
         self.layout = layout
@@ -440,7 +425,7 @@ class NumbaField:
     def evaluate(
         self, state: FieldState, p: Float[Tensor, "n 3"], gradient: bool
     ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"] | None]:
-        """See `FieldBackend`."""
+        """See `SeparateBackend`."""
         grid, network, xyz = self._packed(state, p)
         f = np.empty(len(xyz), np.float32)
         n = np.empty((len(xyz) if gradient else 0, 3), np.float32)
@@ -452,14 +437,9 @@ class NumbaField:
         return torch.from_numpy(f), torch.from_numpy(n) if gradient else None
 
     def pull_back(
-        self,
-        state: FieldState,
-        p: Float[Tensor, "n 3"],
-        g: Float[Tensor, "n"],
-        points: bool,
-        to: Target,
+        self, state: FieldState, p: Float[Tensor, "n 3"], g: Float[Tensor, "n"], points: bool, to: Target
     ) -> Pulled:
-        """See `FieldBackend`; points whose `g` is negligible are left out."""
+        """See `SeparateBackend`; points whose `g` is negligible are left out."""
         heavy = _heavy(g)
         if heavy is not None:
             some = self.pull_back(state, p[heavy], g[heavy], points, to)
@@ -478,14 +458,9 @@ class NumbaField:
         return Pulled(torch.from_numpy(dp) if points else None, mlp)
 
     def pull_back_gradient(
-        self,
-        state: FieldState,
-        p: Float[Tensor, "n 3"],
-        g: Float[Tensor, "n"],
-        v: Float[Tensor, "n 3"],
-        to: Target,
+        self, state: FieldState, p: Float[Tensor, "n 3"], g: Float[Tensor, "n"], v: Float[Tensor, "n 3"], to: Target
     ) -> tuple[Tensor, ...]:
-        """See `FieldBackend`."""
+        """See `SeparateBackend`."""
         grid, network, xyz = self._packed(state, p)
         upstream, direction = _array(g), _array(v)
 

@@ -24,18 +24,12 @@ _ONE, _ZERO, _HALF = np.float32(1), np.float32(0), np.float32(0.5)
 class GridArrays(NamedTuple):
     """A feature grid as the kernels see it."""
 
-    table: ndarray
-    """float32 [rows * 8], flat."""
-    weights: ndarray
-    """float32 [levels]; levels of weight 0 are skipped."""
-    resolutions: ndarray
-    """int64 [levels]."""
-    offsets: ndarray
-    """int64 [levels]: first row."""
-    sizes: ndarray
-    """int64 [levels]: rows."""
-    hashed: ndarray
-    """bool [levels]."""
+    table: ndarray  # float32 [rows * 8], flat
+    weights: ndarray  # float32 [levels]; levels of weight 0 are skipped
+    resolutions: ndarray  # int64 [levels]
+    offsets: ndarray  # int64 [levels]: first row
+    sizes: ndarray  # int64 [levels]: rows
+    hashed: ndarray  # bool [levels]
 
 
 @part

@@ -22,15 +22,15 @@ from sl_nerfstudio.field.device_kernels import obstacle
 from sl_nerfstudio.field.numba_grid import LIST, adam
 from sl_nerfstudio.parallel import parallel, split
 
+Betas = tuple[float, float]
+
 
 class RowAdam(Optimizer):
     """Adam that skips the rows (first dimension) of a parameter whose gradient is exactly zero."""
 
-    def __init__(
-        self, params: Any, lr: float | Tensor = 1e-2, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-15
-    ) -> None:
+    def __init__(self, params: Any, lr: float | Tensor = 1e-2, betas: Betas = (0.9, 0.99), eps: float = 1e-15) -> None:
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
-        self._uploaded: dict[Any, Tensor] = {}
+        self._uploaded: dict[Any, Tensor] = {}  # corrections by device: copied once
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # pyright: ignore
@@ -42,8 +42,7 @@ class RowAdam(Optimizer):
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:
-                    beta1, beta2 = group["betas"]
-                    self._step(parameter, group["lr"], beta1, beta2, group["eps"])
+                    self._step(parameter, group["lr"], group["betas"], group["eps"])
         return loss
 
     def state_dict(self) -> dict[str, Any]:  # pyright: ignore
@@ -56,7 +55,7 @@ class RowAdam(Optimizer):
         states = {key: _unpacked(state) for key, state in state_dict["state"].items()}
         super().load_state_dict({**state_dict, "state": states})
 
-    def _step(self, parameter: nn.Parameter, lr: float | Tensor, beta1: float, beta2: float, eps: float) -> None:
+    def _step(self, parameter: nn.Parameter, lr: float | Tensor, betas: Betas, eps: float) -> None:
         state = self.state[parameter]
         if not state:
             state["moments"] = parameter.new_zeros(len(parameter), 2, *parameter.shape[1:])  # mean, mean square
@@ -65,20 +64,16 @@ class RowAdam(Optimizer):
         if buffer is not None and not buffer.holds(parameter.grad):
             buffer = None
         if _device_kernel_can(parameter):
-            _step_device(parameter, state, lr, beta1, beta2, eps)
+            _step_device(parameter, state, lr, betas, eps)
             if buffer is not None:
                 buffer.note_zero()
         elif buffer is not None and parameter.device.type == "cpu":
-            _step_marked(parameter, buffer, state, _corrections(beta1, beta2), lr, beta1, beta2, eps)
+            _step_marked(parameter, buffer, state, lr, betas, eps)
         else:
-            _step_any(parameter, state, self._corrections_on(parameter.device, beta1, beta2), lr, beta1, beta2, eps)
-
-    def _corrections_on(self, device: torch.device, beta1: float, beta2: float) -> Tensor:
-        """`_corrections` on a device: uploaded once."""
-        key = (device, beta1, beta2)
-        if key not in self._uploaded:
-            self._uploaded[key] = torch.from_numpy(_corrections(beta1, beta2)).to(device)
-        return self._uploaded[key]
+            key = (parameter.device, betas)
+            if key not in self._uploaded:
+                self._uploaded[key] = torch.from_numpy(_corrections(betas)).to(parameter.device)
+            _step_any(parameter, state, self._uploaded[key], lr, betas, eps)
 
 
 def _packed(state: dict[str, Tensor]) -> dict[str, Any]:
@@ -102,31 +97,24 @@ def _unpacked(state: dict[str, Any]) -> dict[str, Tensor]:
 
 
 @lru_cache(maxsize=4)
-def _corrections(beta1: float, beta2: float) -> np.ndarray:
+def _corrections(betas: Betas) -> np.ndarray:
     """Row t: factors that correct step t's moments for their start at zero; constant from the last row on."""
-    until = max(math.log(2**-24) / math.log(beta) if 0 < beta < 1 else 1 for beta in (beta1, beta2))
+    until = max(math.log(2**-24) / math.log(beta) if 0 < beta < 1 else 1 for beta in betas)
     t = np.arange(1, math.ceil(until) + 1)
-    rows = np.stack([1 / (1 - beta1**t), np.sqrt(1 / (1 - beta2**t))], -1)
+    rows = np.stack([1 / (1 - betas[0] ** t), np.sqrt(1 / (1 - betas[1] ** t))], -1)
     return np.concatenate([np.ones((1, 2)), rows]).astype(np.float32)
 
 
 def _step_marked(
-    parameter: Tensor,
-    buffer: TableGradient,
-    state: dict[str, Tensor],
-    corrections: np.ndarray,
-    lr: float | Tensor,
-    beta1: float,
-    beta2: float,
-    eps: float,
+    parameter: Tensor, buffer: TableGradient, state: dict[str, Tensor], lr: float | Tensor, betas: Betas, eps: float
 ) -> None:
     """The compiled step of a table whose gradient is in its persistent buffer."""
     marks = buffer.trusted_marks().numpy()
     arrays = [t.detach().numpy().reshape(-1) for t in (parameter, buffer.buffer, state["moments"], state["steps"])]
-    constants = [np.float32(x) for x in (lr, beta1, beta2, eps)]
+    constants = [_corrections(betas), *(np.float32(x) for x in (lr, *betas, eps))]
 
     def work(start: int, stop: int) -> None:
-        adam(*arrays, marks, start, stop, np.empty(LIST, np.int64), corrections, *constants)
+        adam(*arrays, marks, start, stop, np.empty(LIST, np.int64), *constants)
 
     parallel([partial(work, start, stop) for start, stop in split(len(parameter), 16, 64)])
     increment_version(parameter)
@@ -139,15 +127,15 @@ def _device_kernel_can(parameter: Tensor) -> bool:
 
 
 def _step_device(
-    parameter: nn.Parameter, state: dict[str, Tensor], lr: float | Tensor, beta1: float, beta2: float, eps: float
+    parameter: nn.Parameter, state: dict[str, Tensor], lr: float | Tensor, betas: Betas, eps: float
 ) -> None:
     """The step as one kernel; clears the gradient."""
     from sl_nerfstudio.field.triton_backend import step_table
 
     assert parameter.grad is not None
     rate = lr.reshape(1) if isinstance(lr, Tensor) else torch.full((1,), lr, device=parameter.device)
-    most = len(_corrections(beta1, beta2)) - 1
-    step_table(parameter, parameter.grad, state["moments"], state["steps"], rate, (beta1, beta2), most, eps)
+    most = len(_corrections(betas)) - 1
+    step_table(parameter, parameter.grad, state["moments"], state["steps"], rate, betas, most, eps)
     increment_version([parameter, parameter.grad])
 
 
@@ -156,8 +144,7 @@ def _step_any(
     state: dict[str, Tensor],
     corrections: Tensor,
     lr: float | Tensor,
-    beta1: float,
-    beta2: float,
+    betas: Betas,
     eps: float,
 ) -> None:
     """The same step in torch, for any device, shape and precision."""
@@ -166,8 +153,8 @@ def _step_any(
     assert g is not None
     some = (g != 0).reshape(len(g), -1).any(1)
     shape = (-1,) + (1,) * (g.ndim - 1)
-    mean.copy_(mean.lerp(g, 1 - beta1).where(some.view(shape), mean))
-    square.copy_(square.lerp(g * g, 1 - beta2).where(some.view(shape), square))
+    mean.copy_(mean.lerp(g, 1 - betas[0]).where(some.view(shape), mean))
+    square.copy_(square.lerp(g * g, 1 - betas[1]).where(some.view(shape), square))
     steps.add_(some).clamp_max_(len(corrections) - 1)
     rate, root = corrections.to(g)[steps.long()].unbind(-1)
     step = lr * rate.view(shape) * mean / (square.sqrt() * root.view(shape) + eps)

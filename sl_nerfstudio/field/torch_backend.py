@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from sl_nerfstudio.field.backend import FieldState, Pulled, Target
+from sl_nerfstudio.field.backend import FieldState, Pulled, SeparateBackend, Target
 from sl_nerfstudio.field.hash_grid import FEATURES, PRIMES, GridLayout
 
 # The feature grid in plain torch: the reference for tests of the fast versions, and the version that runs on GPUs.
@@ -80,8 +80,8 @@ def _bend(z: Tensor, width: float) -> Tensor:
     return t * (1 - t) * (3 / width)
 
 
-class TorchField:
-    """`FieldBackend` in torch operations."""
+class TorchField(SeparateBackend):
+    """The field in torch operations."""
 
     def __init__(self, layout: GridLayout, knee: float):
         self.layout = layout
@@ -124,7 +124,7 @@ class TorchField:
     def evaluate(
         self, state: FieldState, p: Float[Tensor, "n 3"], gradient: bool
     ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"] | None]:
-        """See `FieldBackend`."""
+        """See `SeparateBackend`."""
         e, jac = self._encode(state, p, gradient)
         a, z = self._forward(state, e)
         distance, outward = _outside(p)
@@ -134,14 +134,9 @@ class TorchField:
         return f, torch.einsum("nda,nd->na", jac, self._derivatives(state, z)[0][0]) + outward
 
     def pull_back(
-        self,
-        state: FieldState,
-        p: Float[Tensor, "n 3"],
-        g: Float[Tensor, "n"],
-        points: bool,
-        to: Target,
+        self, state: FieldState, p: Float[Tensor, "n 3"], g: Float[Tensor, "n"], points: bool, to: Target
     ) -> Pulled:
-        """See `FieldBackend`."""
+        """See `SeparateBackend`."""
         e, jac = self._encode(state, p, points)
         a, z = self._forward(state, e)
         h, u = self._derivatives(state, z)
@@ -157,14 +152,9 @@ class TorchField:
         return Pulled(dp, (*grads, (g @ a[-1])[None], g.sum()[None]))
 
     def pull_back_gradient(
-        self,
-        state: FieldState,
-        p: Float[Tensor, "n 3"],
-        g: Float[Tensor, "n"],
-        v: Float[Tensor, "n 3"],
-        to: Target,
+        self, state: FieldState, p: Float[Tensor, "n 3"], g: Float[Tensor, "n"], v: Float[Tensor, "n 3"], to: Target
     ) -> tuple[Tensor, ...]:
-        """See `FieldBackend`: one reverse sweep through the pair (f, derivative of f in the direction v)."""
+        """See `SeparateBackend`: one reverse sweep through the pair (f, derivative of f in the direction v)."""
         e, jac = self._encode(state, p, True)
         assert jac is not None
         a, z = self._forward(state, e)

@@ -286,18 +286,14 @@ class _Kept:
     p: Float[Tensor, "n 3"]
     first: int
     encoded: Float[Tensor, "n+k width"]
-    inputs: list[Tensor]
-    """What hidden layers take: encoded points, then activations [n + k, h]."""
-    z: list[Tensor]
-    """Pre-activations [n, h] of the hidden layers."""
-    d: list[Tensor]
-    """Derivatives of the field by them, in the last k of n + k rows; the pull-back fills the others."""
-    h: list[Tensor]
-    """Derivatives of the field by the activations [k, h] of all hidden layers but the last."""
+    inputs: list[Tensor]  # what hidden layers take: encoded points, then activations [n + k, h]
+    z: list[Tensor]  # pre-activations [n, h] of the hidden layers
+    d: list[Tensor]  # derivatives of the field by them, in the last k of n + k rows; the pull-back fills the others
+    h: list[Tensor]  # derivatives of the field by the activations [k, h] of all hidden layers but the last
 
 
 class TritonField:
-    """`MergedBackend` for float32 with 8 features per level."""
+    """`FieldBackend` for float32 with 8 features per level."""
 
     def __init__(self, layout: GridLayout, knee: float):
         self.layout = layout
@@ -305,7 +301,7 @@ class TritonField:
         self._width = 8 + FEATURES * layout.levels
 
     def evaluate_all(self, state: FieldState, p: Float[Tensor, "n 3"], first: int) -> tuple[Tensor, Tensor, _Kept]:
-        """See `MergedBackend`."""
+        """See `FieldBackend`."""
         n, k = len(p), len(p) - first
         weights, biases = _layers(state)
         *lower, last = range(len(weights) - 1)
@@ -330,15 +326,9 @@ class TritonField:
         return f, gradient, _Kept(p.detach(), first, encoded, inputs, z, d, h)
 
     def pull_back_all(
-        self,
-        state: FieldState,
-        kept: _Kept,
-        g: Float[Tensor, "n"],
-        v: Float[Tensor, "k 3"],
-        points: bool,
-        to: Target,
+        self, state: FieldState, kept: _Kept, g: Float[Tensor, "n"], v: Float[Tensor, "k 3"], points: bool, to: Target
     ) -> Pulled:
-        """See `MergedBackend`."""
+        """See `FieldBackend`."""
         p, first, n, k, z = kept.p, kept.first, len(kept.p), len(kept.p) - kept.first, kept.z
         weights, _ = _layers(state)
         last = len(z) - 1

@@ -21,7 +21,7 @@ Y_Z_DOWN = np.diag([1.0, -1.0, -1.0, 1.0])
 # Intrinsics of one device, and of a batch of devices as a tensor.
 
 DeviceKind = Literal["OPENCV", "DOE"]
-"""Names of the device models, the keys of `models.MODELS`."""
+"""Names of the device models, the keys of `MODELS`."""
 PARAMETERS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
@@ -124,12 +124,10 @@ def distortion_jacobian(
     return a, b, d
 
 
-def undistort(
-    xd: Tensor, yd: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Tensor, iterations: int = UNDISTORT_STEPS
-) -> tuple[Tensor, Tensor]:
+def undistort(xd: Tensor, yd: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Tensor) -> tuple[Tensor, Tensor]:
     """Ideal normalised coordinates, from distorted ones: Newton's method, started at the distorted point."""
     x, y = xd, yd
-    for _ in range(iterations):
+    for _ in range(UNDISTORT_STEPS):
         ex, ey = distort(x, y, k1, k2, p1, p2)
         ex, ey = ex - xd, ey - yd
         a, b, d = distortion_jacobian(x, y, k1, k2, p1, p2)
@@ -140,9 +138,20 @@ def undistort(
     return x, y
 
 
-# The pinhole model, "OPENCV": (x, y) = (x' / -z', -y' / -z') for a point p = (x', y', z') in device axes.
-
 _MIN_DEPTH = 1e-6  # of |p|; a point closer to the plane of the device counts as behind it
+
+
+def in_front(x: Number, y: Number, z: Number) -> bool | Tensor:
+    """Whether a point in device axes has a pixel, in all models; plain arithmetic, for tensors and compiled loops."""
+    return -z > _MIN_DEPTH * (x * x + y * y + z * z) ** 0.5
+
+
+def _norm_anywhere(p: Tensor) -> Tensor:
+    """Distance of points from the device; with a finite gradient also at 0."""
+    return (p * p).sum(-1).clamp_min(1e-30).sqrt()
+
+
+# The pinhole model, "OPENCV": (x, y) = (x' / -z', -y' / -z') for a point p = (x', y', z') in device axes.
 
 
 def pinhole_normalised(x: Number, y: Number, z: Number) -> tuple[Number, Number]:
@@ -151,15 +160,10 @@ def pinhole_normalised(x: Number, y: Number, z: Number) -> tuple[Number, Number]
     return x * q, -y * q
 
 
-def pinhole_in_front(x: Number, y: Number, z: Number) -> bool | Tensor:
-    """Whether a point has a pixel."""
-    return -z > _MIN_DEPTH * (x * x + y * y + z * z) ** 0.5
-
-
 def pinhole_normalised_anywhere(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Normalised coordinates and `in_front`; finite, with finite gradients, for points behind as well."""
     x, y, z = p.unbind(-1)
-    norm = (p * p).sum(-1).clamp_min(1e-30).sqrt()
+    norm = _norm_anywhere(p)
     front = -z > _MIN_DEPTH * norm
     return *pinhole_normalised(x, y, -torch.where(front, -z, norm.detach().clamp_min(1e-15))), front
 
@@ -179,9 +183,7 @@ def pinhole_direction(x: Tensor, y: Tensor) -> Tensor:
     return d / d.norm(dim=-1, keepdim=True)
 
 
-# The projector with a diffractive optical element, "DOE": (x, y) = (x' / |p|, -y' / |p|) for a point p = (x', y',
-# z').
-#
+# The projector with a diffractive optical element, "DOE": (x, y) = (x' / |p|, -y' / |p|) for a point p = (x', y', z').
 # Its normalised coordinates are direction cosines, because those of the diffraction orders are evenly spaced (and
 # their tangents are not).
 
@@ -192,15 +194,10 @@ def doe_normalised(x: Number, y: Number, z: Number) -> tuple[Number, Number]:
     return x * q, -y * q
 
 
-def doe_in_front(x: Number, y: Number, z: Number) -> bool | Tensor:
-    """Whether a point has a pixel."""
-    return -z > _MIN_DEPTH * (x * x + y * y + z * z) ** 0.5
-
-
 def doe_normalised_anywhere(p: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Normalised coordinates and `in_front`; finite, with finite gradients, for points behind as well."""
     x, y, z = p.unbind(-1)
-    norm = (p * p).sum(-1).clamp_min(1e-30).sqrt()
+    norm = _norm_anywhere(p)
     q = 1 / norm
     return x * q, -y * q, -z > _MIN_DEPTH * norm
 
@@ -220,7 +217,7 @@ def doe_direction(x: Tensor, y: Tensor) -> Tensor:
     return torch.stack([x, -y, -(1 - x * x - y * y).sqrt()], -1)
 
 
-# The device models by name. A new one is a file beside `pinhole`, an entry in `MODELS` and a branch in `pixel_of`.
+# The device models by name.
 
 
 @dataclass(frozen=True)
@@ -244,8 +241,7 @@ def for_loops(device: Device) -> tuple[int, Float64[ndarray, "8"]]:
     return MODELS[device.model].code, device.parameters
 
 
-_pinhole, _pinhole_in_front = compiled(pinhole_normalised), compiled(pinhole_in_front)
-_doe, _doe_in_front = compiled(doe_normalised), compiled(doe_in_front)
+_pinhole, _doe, _in_front = compiled(pinhole_normalised), compiled(doe_normalised), compiled(in_front)
 _distort, _distortion_jacobian = compiled(distort), compiled(distortion_jacobian)
 
 
@@ -256,12 +252,8 @@ def pixel_of(code, x, y, z, parameters):
     `parameters` are ordered as PARAMETERS. Unlike `project`, it does not detect where the distortion polynomial folds
     back.
     """
-    if code == 0:
-        front = _pinhole_in_front(x, y, z)
-        xn, yn = _pinhole(x, y, z if front else -1.0)
-    else:
-        front = _doe_in_front(x, y, z)
-        xn, yn = _doe(x, y, z)
+    front = _in_front(x, y, z)
+    xn, yn = _pinhole(x, y, z if front else -1.0) if code == 0 else _doe(x, y, z)
     xd, yd = _distort(xn, yn, parameters[4], parameters[5], parameters[6], parameters[7])
     return parameters[0] * xd + parameters[2], parameters[1] * yd + parameters[3], front
 
@@ -321,9 +313,8 @@ def view_of(code, x, y, z, parameters):
 
     `code` is the model's, `parameters` are ordered as PARAMETERS. The derivatives are for points in front.
     """
-    r = (x * x + y * y + z * z) ** 0.5
+    r, front = (x * x + y * y + z * z) ** 0.5, _in_front(x, y, z)
     if code == 0:
-        front = _pinhole_in_front(x, y, z)
         q = 1 / max(r, 1e-15) if not front else -1 / z
         xn, yn = x * q, -y * q
         if not front:
@@ -331,7 +322,6 @@ def view_of(code, x, y, z, parameters):
         ux, uy, uz = q, 0.0, x * q * q
         vx, vy, vz = 0.0, -q, -y * q * q
     else:
-        front = _doe_in_front(x, y, z)
         q = 1 / max(r, 1e-15)
         q3 = q * q * q
         xn, yn = x * q, -y * q

@@ -25,7 +25,7 @@ from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import disturb_image
 from sl_nerfstudio.synthesis.synthesise import make_setup
 from training.edge_errors import continuation_errors
-from training.mirrored import mirrored
+from training.edges import mirrored
 
 SIZE = 64
 

@@ -78,18 +78,6 @@ def test_starts_as_a_sphere() -> None:
 
 
 @pytest.mark.parametrize("backend", ["torch", "numba", "triton"])
-def test_outside_the_box_it_grows_by_the_distance_from_it(backend: str) -> None:
-    field = make_field(backend)
-    on_face = torch.tensor([[1.0, 0.3, -0.2], [0.1, -1.0, 0.7], [1.0, 1.0, -1.0]])
-    outward = torch.tensor([[1.0, 0, 0], [0, -1.0, 0], [3**-0.5, 3**-0.5, -(3**-0.5)]])
-    near = field.sdf(on_face).detach()
-    far, gradient = field.sdf_and_gradient(on_face + 2.5 * outward)
-    torch.testing.assert_close(far.detach(), near + 2.5, atol=1e-5, rtol=0)
-    slope = (gradient.detach() * outward).sum(-1)
-    torch.testing.assert_close(slope, torch.ones(3), atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize("backend", ["torch", "numba", "triton"])
 def test_nan_points_give_nan_values_and_do_not_affect_others(backend: str) -> None:
     field = make_field(backend)
     p = points_around(200).float()
@@ -99,11 +87,9 @@ def test_nan_points_give_nan_values_and_do_not_affect_others(backend: str) -> No
     assert bool(f[17].isnan()) and bool(n[17].isnan().any())
     others = torch.arange(200) != 17
     torch.testing.assert_close(f[others].detach(), clean[others])
-
-
-def test_infinite_points_do_not_crash_the_compiled_kernels() -> None:
-    p = torch.tensor([[float("inf"), 0, 0], [0, float("-inf"), 1e30]])
-    assert bool((make_field("numba").sdf(p) > 1e20).all())
+    if backend == "numba":
+        infinite = torch.tensor([[float("inf"), 0, 0], [0, float("-inf"), 1e30]])
+        assert bool((field.sdf(infinite) > 1e20).all())
 
 
 @pytest.mark.parametrize("n", [0, 1, 7, 129])
@@ -189,13 +175,9 @@ def test_autograd_grad_returns_the_tables_gradient_and_leaves_grad_alone(backend
         assert all(x.grad is None for x in field.parameters())
     for a, b in zip(*results, strict=True):
         assert relative(a, b) < 1e-5
-
-
-def test_autograd_grad_of_points_alone_touches_no_parameter() -> None:
-    field, p = make_field("numba"), points_around(100).float().requires_grad_()
-    (g,) = torch.autograd.grad(field.sdf(p).sum(), p)
-    assert float(g.abs().max()) > 0
-    assert all(x.grad is None for x in field.parameters())
+    q = p.clone().requires_grad_()
+    (by_points,) = torch.autograd.grad(compiled.sdf(q).sum(), q)  # of points alone: no parameter is touched
+    assert bool(by_points.any()) and all(x.grad is None for x in compiled.parameters())
 
 
 def test_the_mlp_learns_with_a_frozen_table_and_vice_versa() -> None:
@@ -260,43 +242,28 @@ class PlaneField(SDFField):
         return p @ self.normal - self.offset
 
 
-NORMAL = (0.48, 0.6, 0.64)
-
-
-def points(half: float = 1.0) -> Tensor:
-    return (torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1) * half
-
-
 def test_a_plane_is_reproduced_exactly_in_the_whole_box():
-    cache, field = CachedGrid(12), PlaneField(NORMAL, 0.1)
+    cache, field = CachedGrid(12), PlaneField((0.48, 0.6, 0.64), 0.1)
     cache.refresh(field)
-    p = torch.cat([points(), torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0], [0.0, 0.0, 0.0]])])
+    p = torch.rand(500, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    p = torch.cat([p, torch.tensor([[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0], [0.0, 0.0, 0.0]])])
     assert torch.allclose(cache.look_up(p), p @ field.normal - 0.1, atol=2e-6)  # each axis has its own slope
-    assert torch.allclose(
-        cache.look_up(3 * p), (3 * p).clamp(-1, 1) @ field.normal - 0.1, atol=2e-6
-    )  # as at the border
+    beyond = (3 * p).clamp(-1, 1) @ field.normal - 0.1  # as at the border
+    assert torch.allclose(cache.look_up(3 * p), beyond, atol=2e-6)
     assert field.evaluated == 12**3 and cache.cell == 2 / 11
 
 
-def test_later_only_the_neighbourhood_of_the_surface_is_updated():
-    cache, before = CachedGrid(20), PlaneField((0.0, 0.0, 1.0), 0.0)
-    cache.refresh(before)
-    after = PlaneField((0.0, 0.0, 1.0), 0.05)
-    cache.refresh(after)
+def test_later_only_the_neighbourhood_of_the_surface_is_updated_also_after_a_checkpoint():
+    """So a resumed run has the same values as an uninterrupted one."""
+    cache, resumed = CachedGrid(20), CachedGrid(20)
+    cache.refresh(PlaneField((0.0, 0.0, 1.0), 0.0))
+    resumed.load_state_dict(cache.state_dict())
     z = torch.linspace(-1, 1, 20)
     near = z.abs() < 3 * cache.cell
-    assert torch.allclose(cache.values[near][:, 0, 0], z[near] - 0.05, atol=1e-6)
-    assert torch.allclose(cache.values[~near][:, 0, 0], z[~near], atol=1e-6)
-    assert after.evaluated == int(near.sum()) * 400
-
-
-def test_it_is_saved_in_a_checkpoint():
-    """A resumed run continues with the same values, and updates only those that an uninterrupted one would."""
-    cache, field = CachedGrid(20), PlaneField((0.0, 0.0, 1.0), 0.0)
-    cache.refresh(field)
-    resumed = CachedGrid(20)
-    resumed.load_state_dict(cache.state_dict())
-    assert torch.equal(resumed.values, cache.values)
     for one in (cache, resumed):
-        one.refresh(PlaneField((0.0, 0.0, 1.0), 0.05))
+        after = PlaneField((0.0, 0.0, 1.0), 0.05)
+        one.refresh(after)
+        assert torch.allclose(one.values[near][:, 0, 0], z[near] - 0.05, atol=1e-6)
+        assert torch.allclose(one.values[~near][:, 0, 0], z[~near], atol=1e-6)
+        assert after.evaluated == int(near.sum()) * 400
     assert torch.equal(resumed.values, cache.values)

@@ -64,9 +64,9 @@ def test_the_step_of_the_table_is_the_plain_one_and_clears_the_gradient() -> Non
         gradient = torch.randn(500, 8) * (torch.rand(500, 1) < 0.6)
         ours.grad, plain.grad = gradient.clone(), gradient.clone()
         lr: float | Tensor = rate if step % 2 else 0.02  # a tensor is read by the kernel, not when it is queued
-        _step_device(ours, states[0], lr, 0.9, 0.99, 1e-8)
+        _step_device(ours, states[0], lr, (0.9, 0.99), 1e-8)
         with torch.no_grad():
-            _step_any(plain, states[1], torch.from_numpy(_corrections(0.9, 0.99)), 0.02, 0.9, 0.99, 1e-8)
+            _step_any(plain, states[1], torch.from_numpy(_corrections((0.9, 0.99))), 0.02, (0.9, 0.99), 1e-8)
         assert not bool(ours.grad.any())
     assert relative(ours, plain) < 1e-6
     assert torch.equal(states[0]["steps"], states[1]["steps"])
@@ -79,9 +79,9 @@ def test_long_runs_correct_the_moments_as_exactly_as_the_plain_step() -> None:
         states = [{"moments": torch.rand(1, 2, 8), "steps": torch.full((1,), t - 1)}]
         states.append({name: x.clone() for name, x in states[0].items()})
         ours.grad, plain.grad = torch.ones(1, 8), torch.ones(1, 8)
-        _step_device(ours, states[0], 1.0, 0.9, 0.999, 1e-8)
+        _step_device(ours, states[0], 1.0, (0.9, 0.999), 1e-8)
         with torch.no_grad():
-            _step_any(plain, states[1], torch.from_numpy(_corrections(0.9, 0.999)), 1.0, 0.9, 0.999, 1e-8)
+            _step_any(plain, states[1], torch.from_numpy(_corrections((0.9, 0.999))), 1.0, (0.9, 0.999), 1e-8)
         torch.testing.assert_close(ours, plain, rtol=2e-6, atol=0)
 
 

@@ -66,13 +66,6 @@ def test_stated_uncertainty_covers_the_errors_against_the_frames_around(lap):
     assert np.quantile(ratios, 0.95) < 3
 
 
-def test_standing_still_adds_nothing():
-    tracker = Tracker()
-    found = walk(tracker, [sights()[0], sights()[0], sights()[1], sights()[1], sights()[1]])
-    assert [placed.state for placed in found] == [State.TRACKED] * 5
-    assert kept_places(found, range(5)) == [0, 2]
-
-
 def test_a_loss_is_said_with_its_cause_and_ends_where_the_object_is_seen_again():
     tracker, places = Tracker(), [0, 1, 2, 3]
     assert all(placed.state is State.TRACKED for placed in walk(tracker, [sights()[k] for k in places]))
@@ -117,10 +110,3 @@ def test_a_first_frame_that_nothing_fits_is_given_up():
     for place, S in zip(kept[1:], tracker.model.nodes.values(), strict=True):
         relative = RIG.T_world_camera[kept[1], :3, :3].T @ RIG.T_world_camera[place, :3, :3]
         assert turn_deg(relative.numpy(), S.R) < 0.5
-
-
-@pytest.mark.slow
-def test_the_same_frames_give_the_same_places(lap):
-    again = Tracker()
-    for before, now in zip(lap[1], walk(again, sights()[:4]), strict=False):
-        np.testing.assert_array_equal(before.S_world_camera.matrix(), now.S_world_camera.matrix())

@@ -117,13 +117,9 @@ def test_weights_are_shares_of_one_without_overflow(dtype, kappa):
     assert (weights >= 0).all() and (weights.sum(-1) <= 1 + 1e-5).all()
     weights.square().sum().backward()
     assert f.grad is not None and f.grad.isfinite().all()
-
-
-def test_an_infinitely_sharp_wall_is_one_interval():
-    f = torch.tensor([[3.0, 2.0, 1.0, -1.0, -2.0, 1.0, -1.0]])
-    assert torch.equal(interval_weights(f, 1e4), torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]]))
-    outside = interval_weights(f.abs() + 1, 1e4)
-    assert outside.sum() == 0
+    wall = torch.tensor([[3.0, 2.0, 1.0, -1.0, -2.0, 1.0, -1.0]], dtype=dtype)  # infinitely sharp: one interval
+    assert torch.equal(interval_weights(wall, 1e4), torch.tensor([[0.0, 0.0, 1.0, 0.0, 0.0, 0.0]], dtype=dtype))
+    assert not interval_weights(wall.abs() + 1, 1e4).any()
 
 
 def camera_rays() -> tuple[torch.Tensor, torch.Tensor]:
@@ -171,13 +167,16 @@ def test_a_ball_converges_to_ray_casting():
     assert (r.pattern - look_up(pattern, uv)).abs().max() < 1e-2
 
 
-def test_behind_the_projector_nothing_is_lit_but_there_is_depth():
-    r = rendered(400.0, 400, projector_pose(flip=True))
-    assert torch.equal(r.lit, torch.zeros_like(r.lit)) and torch.equal(r.pattern, torch.zeros_like(r.pattern))
-    assert torch.equal(r.coordinates, torch.zeros_like(r.coordinates)) and r.coordinates.isfinite().all()
-    assert (r.accumulation > 0.99).all()
-    o, d = camera_rays()
-    assert (r.depth - exact_depth(o, d)).abs().max() < 1e-2
+@pytest.mark.parametrize("flip", [True, False])
+def test_without_light_there_is_depth_and_no_intensity(flip):
+    """Behind the projector there are no coordinates; outside the pattern they continue."""
+    r = rendered(400.0, 400, projector_pose(x=0.8 if flip else 2.5, flip=flip))
+    assert not r.pattern.any()
+    if flip:
+        assert not r.lit.any() and not r.coordinates.any()
+    else:
+        assert (r.coordinates[:, 0] < -2).all() and (r.lit > 0.999).all()
+    assert (r.accumulation > 0.99).all() and (r.depth - exact_depth(*camera_rays())).abs().max() < 1e-2
 
 
 def test_only_what_is_in_front_of_the_projector_makes_the_coordinate():
@@ -192,12 +191,6 @@ def test_only_what_is_in_front_of_the_projector_makes_the_coordinate():
     assert float(r.lit) == pytest.approx(0.5, abs=1e-5)
     assert torch.allclose(r.coordinates, expected, rtol=1e-5)
     assert float(r.pattern) == pytest.approx(0.5, abs=1e-5)
-
-
-def test_outside_the_pattern_coordinates_continue_and_the_intensity_is_zero():
-    r = rendered(400.0, 400, projector_pose(x=2.5))
-    assert (r.coordinates[:, 0] < -2).all() and (r.lit > 0.999).all()
-    assert torch.equal(r.pattern, torch.zeros_like(r.pattern))
 
 
 def test_a_ray_through_nothing_has_no_weight_and_no_nan():

@@ -90,15 +90,6 @@ def test_it_is_not_trained_further_with_other_settings(scan_root, finished, capf
 
 
 @pytest.mark.slow
-def test_it_is_trained_further_with_other_settings_that_have_no_effect(scan_root, tmp_path):
-    train(settings(scan_root, tmp_path, steps=2))
-    further = settings(scan_root, tmp_path, steps=1, load_dir=folder_of(tmp_path) / "nerfstudio_models")
-    further.pipeline.model.eval_num_rays_per_chunk = 512
-    train(further)
-    assert last_state(folder_of(tmp_path))["step"] == 2
-
-
-@pytest.mark.slow
 def test_it_branches_off_into_another_folder(scan_root, finished, tmp_path):
     """There, settings may change, and its checkpoint belongs to the new config.yml."""
     other = settings(scan_root, tmp_path, "other", steps=2, load_dir=finished / "nerfstudio_models")
