@@ -301,9 +301,9 @@ def _small_lamps(stage: FrameGeometry, look: Look) -> SmallLamps:
     place = (np.arange(_LAMPS_ACROSS) + 0.5) / _LAMPS_ACROSS
     uv = np.stack(np.meshgrid(place * projector.w, place * projector.h), -1).reshape(-1, 2)
     direction = rays(projector, stage.T_world_projector, uv)
-    hits = stage.caster.first_hits(origin, direction)
-    hit = hits.face >= 0
-    p, face = hits.p_world[hit], hits.face[hit]
+    face, p = stage.caster.first_hits(origin, direction)
+    hit = face >= 0
+    p, face = p[hit], face[hit]
     distance = np.linalg.norm(p - origin, axis=-1)
     # light through a cell of the bundle: strength at a distance, times the cell's area there
     side = distance / projector.fl_x * projector.w / _LAMPS_ACROSS

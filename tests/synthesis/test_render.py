@@ -5,7 +5,7 @@ import pytest
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
+from sl_nerfstudio.synthesis.appearance import Appearance, corner_fall_off, make_appearance
 from sl_nerfstudio.synthesis.devices import DevicePair
 from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, render_capture
 from sl_nerfstudio.synthesis.sdf import Scene
@@ -39,7 +39,7 @@ T_CAMERA, T_PROJECTOR = above(0.0, 300.0), above(60.0, 300.0)
 
 def test_light_follows_the_cosine_and_distance_laws():
     scene = scene_of(square(80.0, 0.0))
-    plain = Appearance(300.0, np.zeros((1, 3)), np.zeros(1), albedo_contrast=0.0, corner_loss=0.0, blur=1e-6)
+    plain = Appearance(300.0, lambda p: p[:, 0], albedo_contrast=0.0, corner_loss=0.0, blur=1e-6)
     pattern = np.ones((PROJECTOR.h, PROJECTOR.w), dtype=np.float32)
     shown = render_capture(FrameGeometry(RayCaster(scene), DEVICES, T_CAMERA, T_PROJECTOR), pattern, plain, 1)
     x = 3.0 * (np.arange(CAMERA.w) + 0.5 - 32)
@@ -71,7 +71,7 @@ def test_appearance_is_within_physical_limits_and_random_by_its_seed():
     assert np.array_equal(albedo, again.albedo(p)) and not np.array_equal(albedo, other.albedo(p))
     assert albedo.min() >= 0.25 and albedo.max() <= 1.0
     assert albedo.mean() == pytest.approx(look.mean_albedo, abs=0.05)
-    middle, corner = look.projector_fall_off(np.array([[100.0, 80.0], [0.0, 0.0]]), PROJECTOR)
+    middle, corner = corner_fall_off(np.array([[100.0, 80.0], [0.0, 0.0]]), PROJECTOR, look.corner_loss)
     assert (middle, corner) == (1.0, pytest.approx(1 - look.corner_loss))
     assert look.projected(np.array([0.0, 1.0], dtype=np.float32)) == pytest.approx([look.dark_leak, 1.0])
     up = look.ambient(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], dtype=np.float32))

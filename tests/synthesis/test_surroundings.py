@@ -44,7 +44,7 @@ def test_the_object_stays_what_it_is_among_its_surroundings():
     caster = RayCaster(scene, around)
     down = np.array([[0.0, 0.0, -1.0]])
     eyes = scene.centre + np.array([[0.0, 0, 300], [0.9 * scene.size, 0, 300], [9 * scene.size, 0, 300]])
-    faces = np.concatenate([caster.first_hits(eye, down).face for eye in eyes])
+    faces = np.concatenate([caster.first_hits(eye, down)[0] for eye in eyes])
     assert caster.on_object(faces).tolist() == [True, False, False] and (faces >= 0).tolist() == [True, True, False]
 
 
