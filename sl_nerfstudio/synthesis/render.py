@@ -185,6 +185,11 @@ class VisiblePoints:
     uv_projector: Float64[ndarray, "n 2"]
     lit: Bool[ndarray, "n"]  # hit, inside the pattern, and lit on the side that the camera sees
 
+    def coords(self, camera: Device) -> Float32[ndarray, "h w 2"]:
+        """Pattern pixels seen through all pixels of a camera, row by row; NaN where no light falls."""
+        lit = np.where(self.lit[:, None], self.uv_projector, np.nan)
+        return lit.astype(np.float32).reshape(camera.h, camera.w, 2)
+
 
 @dataclass(frozen=True)
 class RenderedCapture:
@@ -255,11 +260,9 @@ def sample_view(
         for dx in step:
             total += light(visible_points(frame, corner[near] + (dx, dy)), near)
     radiance[near] = total / supersampling**2
-    coords = np.full((h * w, 2), np.nan, dtype=np.float32)
-    coords[centres.lit] = centres.uv_projector[centres.lit]
     on_object = frame.caster.on_object(centres.face)
     return RenderedCapture(
-        coords.reshape(h, w, 2),
+        centres.coords(frame.devices.camera),
         centres.lit.reshape(h, w),
         on_object.reshape(h, w),
         radiance.reshape(h, w, *np.shape(nothing)),
