@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,14 +20,12 @@ _CONFIG = SynthConfig(frames=4, resolution=72, seed=3)
 @pytest.fixture(scope="module")
 def make(tmp_path_factory):
     """Makes each scan once."""
-    made = {}
 
+    @cache
     def scan(**options):
-        key = tuple(sorted(options.items()))
-        if key not in made:
-            made[key] = tmp_path_factory.mktemp("scan") / "scan"
-            synthesise(replace(_CONFIG, **options), made[key])
-        return made[key]
+        root = tmp_path_factory.mktemp("scan") / "scan"
+        synthesise(replace(_CONFIG, **options), root)
+        return root
 
     return scan
 

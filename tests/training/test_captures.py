@@ -1,4 +1,4 @@
-"""Random captures and graphs: the truth that comes with them is right."""
+"""Random captures, photographs and graphs: the truth that comes with them is right; the fit of right matches."""
 
 import numpy as np
 import pytest
@@ -6,8 +6,11 @@ import pytest
 from sl_nerfstudio.decoding.grid_graph import STEPS, neighbourhoods
 from sl_nerfstudio.pattern.codes import rotate_codes
 from training.captures import random_capture
+from training.edge_captures import edge_capture
 from training.graphs import Damage, damage_graph
+from training.matching import fit_logistic
 from training.patterns import PatternStock
+from training.rendered_captures import rendered_captures
 
 
 @pytest.fixture(scope="module")
@@ -40,3 +43,23 @@ def test_damaged_graphs_are_parts_of_the_turned_pattern(turn):
         assert (graph.place[b] == graph.place[a] + step).all()
         assert (graph.neighbour[b, (direction + 2) % 4] == a).all()
     assert neighbourhoods(graph.neighbour).max() < len(graph.place)
+
+
+def test_rendered_captures_can_be_read_and_their_truth_fits_what_is_read():
+    found = list(rendered_captures(0, 2, 2))
+    assert len(found) == 2 and all(one.image.shape == one.true.shape[:2] for one in found)
+    captures = [edge_capture(one.image, one.grid, one.true) for one in found]
+    errors = [np.linalg.norm(c.view.fitted - c.true, axis=-1) for c in captures if c is not None]
+    assert errors and all(np.nanmedian(error) < 0.05 for error in errors)
+
+
+def test_the_weights_that_made_the_data_are_found():
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(200_000, 3)) * [1.0, 20.0, 0.1] + [0.0, 100.0, -2.0]
+    constant, weights = -1.0, np.array([0.7, -0.05, 8.0])
+    right = rng.random(len(x)) < 1 / (1 + np.exp(-(constant + 15 + x @ weights + 5)))
+    found, slopes = fit_logistic(x, right)
+    np.testing.assert_allclose(slopes, weights, rtol=0.05)
+    assert abs(found - (constant + 20)) < 1.0
+    p = 1 / (1 + np.exp(-(found + x @ slopes)))
+    assert abs(p.mean() - right.mean()) < 1e-3  # a fit of the largest likelihood is calibrated
