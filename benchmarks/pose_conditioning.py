@@ -26,21 +26,8 @@ from benchmarks.common.measuring import Rows, kept_rows, options
 from benchmarks.common.runs import made_once
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.reference import compare_poses
-from sl_nerfstudio.geometry.devices import (
-    Intrinsics,
-    project,
-    project_jacobian,
-    unproject,
-)
-from sl_nerfstudio.geometry.lie import (
-    DevicePoses,
-    Similarity,
-    adjoint,
-    exp_se3,
-    inverse,
-    rotate,
-    transform,
-)
+from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian, unproject
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, adjoint, exp_se3, inverse, rotate, transform
 from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import read_ground_truth

@@ -51,9 +51,7 @@ def oriented_cloud(p_camera: Float[ndarray, "n 3"], T: Float[ndarray, "4 4"], vo
 
 
 def _multiway(
-    clouds: Sequence[o3d.geometry.PointCloud],
-    T_world_camera: Float[ndarray, "n 4 4"],
-    distances: Sequence[float],
+    clouds: Sequence[o3d.geometry.PointCloud], T_world_camera: Float[ndarray, "n 4 4"], distances: Sequence[float]
 ) -> Float[ndarray, "n 4 4"]:
     """Motion of each cloud; the first one stays."""
     registration = o3d.pipelines.registration

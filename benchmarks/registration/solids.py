@@ -17,14 +17,12 @@ def ball(centre: Sequence[float], radii: float | Sequence[float]) -> Solid:
     return lambda p: (np.linalg.norm((p - np.asarray(centre)) / r, axis=-1) - 1) * r.min()
 
 
-def block(centre: Sequence[float], sides: Sequence[float], rounding: float = 0.5, turn_deg: float = 0.0) -> Solid:
-    """A box with rounded edges, turned about the vertical through its centre."""
+def block(centre: Sequence[float], sides: Sequence[float], rounding: float = 0.5) -> Solid:
+    """A box with rounded edges."""
     half = np.asarray(sides, dtype=float) / 2 - rounding
-    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
 
     def distance(p: ndarray) -> ndarray:
-        x, y, z = np.moveaxis(p - np.asarray(centre), -1, 0)
-        q = np.abs(np.stack([c * x + s * y, c * y - s * x, z], -1)) - half
+        q = np.abs(p - np.asarray(centre)) - half
         return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0) - rounding
 
     return distance

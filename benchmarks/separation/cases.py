@@ -15,13 +15,7 @@ from sl_nerfstudio.geometry.triangulation import epipolar_residual
 from sl_nerfstudio.object_separation.planes import DecodedFrame
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.devices import (
-    CoordinateNoise,
-    DevicePair,
-    disturb_coords,
-    make_devices,
-    make_paths,
-)
+from sl_nerfstudio.synthesis.devices import CoordinateNoise, DevicePair, disturb_coords, make_devices, make_paths
 from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, above_the_table, visible_centres
 from sl_nerfstudio.synthesis.sdf import Scene
 from sl_nerfstudio.synthesis.synthesise import make_cells

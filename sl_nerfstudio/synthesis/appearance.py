@@ -187,7 +187,8 @@ TEXTURES: dict[str, TextureMaker] = {
 
 def _waves(size: float, lengths: Range, rng: np.random.Generator, count: int = 12) -> Texture:
     """A smooth random function with mean 0 and standard deviation 1; wavelengths in sizes of the object."""
-    wavelength = size * np.exp(rng.uniform(*np.log(lengths), count))
+    shortest, longest = np.log(lengths)
+    wavelength = size * np.exp(rng.uniform(shortest, longest, count))
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     k = (direction * (2 * np.pi / wavelength)[:, None]).T.astype(np.float32)

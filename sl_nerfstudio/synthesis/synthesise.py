@@ -38,14 +38,7 @@ from sl_nerfstudio.synthesis.devices import (
     make_paths,
     pose_sigma,
 )
-from sl_nerfstudio.synthesis.photograph import (
-    Photograph,
-    Shot,
-    choose_useless,
-    plan_shots,
-    take_photograph,
-    turn_away,
-)
+from sl_nerfstudio.synthesis.photograph import Photograph, Shot, choose_useless, plan_shots, take_photograph, turn_away
 from sl_nerfstudio.synthesis.render import (
     FrameGeometry,
     RayCaster,

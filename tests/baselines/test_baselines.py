@@ -4,21 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from benchmarks.baselines.frame_to_model import fuse_frame_to_model
 from benchmarks.baselines.poses import register
 from benchmarks.baselines.tsdf import backprojected, fuse, triangulated_depth
-from benchmarks.baselines.window_matching import match_windows
-from sl_nerfstudio.decoding.grid_graph import one_hot, turned_pattern
 from sl_nerfstudio.evaluation.evaluate import score_alignments
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import compare_poses, mesh_reference
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.files import read_mesh
-from sl_nerfstudio.pattern.codes import code_array
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
@@ -96,9 +91,8 @@ def test_frame_to_model_fusion_recovers_the_poses_of_frames_without_noise(
     assert np.percentile(IndexedMesh(surface).distance(mesh.vertices), 95) < 1.0
 
 
-# Depth maps and window matching, against formulas.
+# Depth maps.
 
-PATTERN = turned_pattern(code_array(12, 14, seed=3))
 LENS = (-0.12, 0.05, 1e-3, -2e-3)
 
 
@@ -122,18 +116,3 @@ def test_depth_maps_are_those_of_an_ideal_pinhole(distorted: Scan) -> None:
     footprint = np.median(-points[:, 2]) / frame.camera.fl_x
     assert np.percentile(surface.distance(p_world), 95) < footprint
     assert (depth.depth > 0).sum() == pytest.approx(frame.read_mask().sum(), rel=0.1)
-
-
-@given(st.integers(0, 2**31 - 1), st.integers(0, 3))
-def test_one_wrong_symbol_changes_nothing_but_random_symbols_match_nothing_reliably(seed: int, turn: int) -> None:
-    rng = np.random.default_rng(seed)
-    mine = np.flatnonzero(PATTERN.turn == turn)
-    around = np.where(PATTERN.around[mine] < 0, -1, PATTERN.around[mine] - mine[0]).astype(np.int32)
-    symbol = PATTERN.symbol[mine].copy()
-    wrong = int(rng.integers(len(mine)))
-    symbol[wrong] = (symbol[wrong] + rng.integers(1, 5)) % 5
-    found = match_windows(one_hot(symbol).numpy(), around, PATTERN, 1)
-    assert (found == mine).mean() > 0.98 and found[wrong] in (mine[wrong], -1)
-    noise = rng.integers(0, 5, len(mine)).astype(symbol.dtype)
-    found = match_windows(one_hot(noise).numpy(), around, PATTERN, 0)
-    assert (found == -1).mean() > 0.8

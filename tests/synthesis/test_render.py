@@ -12,13 +12,7 @@ from sl_nerfstudio.synthesis.appearance import Appearance, make_appearance
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import DevicePair
 from sl_nerfstudio.synthesis.photograph import SmallLamps, interpolate_vectors, light_vectors
-from sl_nerfstudio.synthesis.render import (
-    FrameGeometry,
-    RayCaster,
-    above_the_table,
-    make_surroundings,
-    render_capture,
-)
+from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, above_the_table, make_surroundings, render_capture
 from sl_nerfstudio.synthesis.scenes import BUILT_IN
 from sl_nerfstudio.synthesis.sdf import Scene
 from sl_nerfstudio.synthesis.synthesise import make_setup, synthesise
