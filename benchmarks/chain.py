@@ -235,9 +235,7 @@ def main() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         case = Case(frames, given.resolution, given.steps, given.jobs, folder.absolute())
         for name, stage in stages(case, given.start == "photographs", given.until, given.before).items():
-            if (name, frames, given.resolution, given.jobs) not in {
-                (r.stage, r.frames, r.resolution, r.jobs) for r in rows
-            }:
+            if not rows.have(stage=name, frames=frames, resolution=given.resolution, jobs=given.jobs):
                 rows.add(*stage())
     print(table(rows))
 

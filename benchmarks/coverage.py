@@ -198,11 +198,6 @@ class Row:
     apart: float | None  # results of rough and true starts, RMS over all pose parameters, in sigma
     seconds: float
 
-    @property
-    def key(self) -> tuple[str, int, str]:
-        """What it was measured on."""
-        return self.scene, self.seed, self.noise
-
 
 def measure(exact: ExactScan, scene: str, seed: int, noise: str) -> Row:
     """Adjust from rough starting poses; the first scan with usual noise also from the true ones."""
@@ -249,7 +244,7 @@ def main() -> None:
     rows = Rows(given.output, kept_rows(given.output, Row))
     for seed in given.seeds:
         for scene in given.scenes:
-            wanted = [n for n in given.noises if (scene, seed, n) not in {r.key for r in rows}]
+            wanted = [n for n in given.noises if not rows.have(scene=scene, seed=seed, noise=n)]
             exact = exact_scan(scene, seed) if wanted else None
             for noise in wanted:
                 assert exact is not None

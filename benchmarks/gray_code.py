@@ -16,12 +16,7 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from benchmarks.common.measuring import options
-from sl_nerfstudio.geometry.devices import (
-    Device,
-    Intrinsics,
-    project,
-    unproject,
-)
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.lie import angle_deg, fit_similarity
 from sl_nerfstudio.geometry.triangulation import pixel_centres, triangulate
 from sl_nerfstudio.scan import Frame, Scan, read_scan

@@ -21,13 +21,12 @@ import torch
 from torch import Tensor
 
 from benchmarks.common.measuring import Rows, parsed
-from benchmarks.common.runs import made_once
+from benchmarks.common.runs import scan_to_train_on
 from benchmarks.common.training import Training, model_of, settings
 from sl_nerfstudio.field import backend, device_kernels
 from sl_nerfstudio.field.device_kernels import name_of
 from sl_nerfstudio.field.optimiser import RowAdam, _step_device
 from sl_nerfstudio.model.kernel_step import kernel_step
-from sl_nerfstudio.synthesis.config import SynthConfig
 
 _METHODS = ("sl-neus", "sl-neus-paper")
 
@@ -144,7 +143,7 @@ def main(config: Config) -> list[Row]:
         raise SystemExit("TRITON_INTERPRET=1 is set: kernels would not be compiled")
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    scan = config.scan or made_once(SynthConfig(frames=4, resolution=96), Path("outputs/bench")).scan.root
+    scan = scan_to_train_on(config.scan)
     launches = [launch for method in _METHODS for launch in launches_of_a_step(method, scan)]
     rows: Rows[Row] = Rows(config.output)
     for architecture in config.architectures:

@@ -18,12 +18,11 @@ from typing import Literal
 import torch
 
 from benchmarks.common.measuring import Rows, parsed
-from benchmarks.common.runs import made_once
+from benchmarks.common.runs import scan_to_train_on
 from benchmarks.common.training import Training, data_of, model_of, settings
 from benchmarks.pretended.gpu import PretendedGpu
 from benchmarks.pretended.recorder import PretendedRecorder
 from sl_nerfstudio.model.loop import WARM_UP
-from sl_nerfstudio.synthesis.config import SynthConfig
 
 Backend = Literal["torch", "triton"]
 METHODS = {"paper": "sl-neus-paper", "default": "sl-neus"}
@@ -60,7 +59,7 @@ class Row:
 def count(size: str, backend: Backend, config: Config) -> Row:
     """Take some steps, all terms and all levels in use, and count."""
     with PretendedGpu(kernels=backend == "triton", dry=True) as gpu, tempfile.TemporaryDirectory() as folder:
-        run = settings(METHODS[size], _scan(config), Path(folder), "cuda", 1000)
+        run = settings(METHODS[size], scan_to_train_on(config.scan), Path(folder), "cuda", 1000)
         run.cuda_graph = False
         model_of(run).sdf.backend = backend
         if config.rays is not None:
@@ -96,12 +95,6 @@ def _steps(training: Training, gpu: PretendedGpu) -> tuple[list, list]:
         steps.append(step)
         between.append(before)
     return steps, between
-
-
-def _scan(config: Config) -> Path:
-    if config.scan is not None:
-        return config.scan
-    return made_once(SynthConfig(frames=4, resolution=96), Path("outputs/bench")).scan.root
 
 
 def main(config: Config) -> list[Row]:

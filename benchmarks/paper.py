@@ -170,7 +170,7 @@ def main() -> None:
     rows: Rows[Row] = Rows(output, kept_rows(output, _row))
     with TemporaryDirectory() as parent:
         for number, case in enumerate(cases(name, given)):
-            if case not in {row.case for row in rows}:
+            if not rows.have(case=case):
                 scan = Path(parent) / f"{case.scene}-{case.seed}-{case.decoding.replace(' ', '-')}"
                 scan.mkdir(exist_ok=True)
                 folder = Path(parent) / str(number)

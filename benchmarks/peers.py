@@ -313,7 +313,7 @@ def main() -> None:
         config = config_of(name, given.frames, given.resolution, given.keep)
         case = Case(captures.name, captures, config, read_truth(captures))
         for method in given.methods:
-            if not any((row.set, row.method) == (case.name, method) for row in rows):
+            if not rows.have(set=case.name, method=method):
                 rows.add(measure(case, method))
 
 

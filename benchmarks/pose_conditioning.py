@@ -26,21 +26,8 @@ from benchmarks.common.measuring import Rows, kept_rows, options
 from benchmarks.common.runs import made_once
 from sl_nerfstudio.dataparser.dataparser import LoadedScan
 from sl_nerfstudio.evaluation.reference import compare_poses
-from sl_nerfstudio.geometry.devices import (
-    Intrinsics,
-    project,
-    project_jacobian,
-    unproject,
-)
-from sl_nerfstudio.geometry.lie import (
-    DevicePoses,
-    Similarity,
-    adjoint,
-    exp_se3,
-    inverse,
-    rotate,
-    transform,
-)
+from sl_nerfstudio.geometry.devices import Intrinsics, project, project_jacobian, unproject
+from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, adjoint, exp_se3, inverse, rotate, transform
 from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import read_ground_truth
@@ -274,11 +261,6 @@ class Row:
     largest_root: float
     seconds: float
 
-    @property
-    def key(self) -> tuple[str, int, str, int]:
-        """What it was measured on."""
-        return self.scene, self.seed, self.way, self.steps
-
 
 def measure(problem: Problem, S: Similarity, poses: tuple[DevicePoses, DevicePoses], key: tuple, seed: int) -> Row:
     """One way from the starting poses (the second are the true ones)."""
@@ -315,7 +297,8 @@ def main() -> None:
     for seed in given.seeds:
         for scene in given.scenes:
             keys = [(scene, seed, w, _ITERATIONS if w == GAUSS_NEWTON else given.steps) for w in given.ways]
-            wanted = [key for key in keys if key not in {row.key for row in rows}]
+            names = ("scene", "seed", "way", "steps")
+            wanted = [key for key in keys if not rows.have(**dict(zip(names, key, strict=True)))]
             if not wanted:
                 continue
             loaded = made_once(SynthConfig(scene=scene, frames=FRAMES[scene], seed=seed), given.folder)

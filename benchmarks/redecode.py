@@ -152,9 +152,9 @@ def _truth(config: SynthConfig) -> tuple[Float32[ndarray, "n h w 2"], Float64[nd
     seen = [
         visible_centres(FrameGeometry(setup.caster, setup.devices, camera, projector)) for camera, projector in poses
     ]
-    size = (setup.devices.camera.h, setup.devices.camera.w)
-    maps = [np.where(s.lit[:, None], s.uv_projector, np.nan).reshape(*size, 2) for s in seen]
-    return np.stack(maps).astype(np.float32), np.concatenate([s.p_world[s.lit][::5] for s in seen])
+    return np.stack([s.coords(setup.devices.camera) for s in seen]), np.concatenate(
+        [s.p_world[s.lit][::5] for s in seen]
+    )
 
 
 def _errors(coords: Float32[ndarray, "n h w 2"], truth: Float32[ndarray, "n h w 2"]) -> Float32[ndarray, "n h w"]:
@@ -174,12 +174,11 @@ def main() -> None:
     """Run the benchmark."""
     config = parsed(Config, __doc__)
     rows = Rows(config.output, kept_rows(config.output, _row))
-    size = (config.frames, config.resolution, config.iterations, config.seed)
-    done = {(r.scene, r.appearance, r.missing, r.frames, r.resolution, r.iterations, r.seed) for r in rows}
+    size = {name: getattr(config, name) for name in ("frames", "resolution", "iterations", "seed")}
     kinds = [("plain", share) for share in config.missing] + [("realistic", share) for share in config.realistic]
     for scene in config.scenes:
         for appearance, missing in kinds:
-            if (scene, appearance, missing, *size) not in done:
+            if not rows.have(scene=scene, appearance=appearance, missing=missing, **size):
                 with TemporaryDirectory() as folder:
                     rows.add(measure(scene, appearance, missing, config, Path(folder)))
 

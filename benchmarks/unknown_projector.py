@@ -78,7 +78,7 @@ def make_set(options: SetOptions) -> CoordinateSet:
     for k in range(options.frames):
         seen = visible_centres(FrameGeometry(caster, devices, poses.T_world_camera[k], poses.T_world_projector[k]))
         shape = devices.camera.h, devices.camera.w
-        exact = np.where(seen.lit[:, None], seen.uv_projector, np.nan).astype(np.float32).reshape(*shape, 2)
+        exact = seen.coords(devices.camera)
         rng = np.random.default_rng([options.seed, 2, k])
         coords.append(disturb_coords(exact, seen.lit.reshape(shape), cells, NOISE, rng))
         points.append(seen.p_world.reshape(*shape, 3))

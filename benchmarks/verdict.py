@@ -116,7 +116,7 @@ def main() -> None:
     rows = Rows(given.output, kept_rows(given.output, Row))
     for name in given.faults:
         for scene in given.scenes:
-            if (scene, name) not in {(row.scene, row.fault) for row in rows}:
+            if not rows.have(scene=scene, fault=name):
                 rows.add(measure(scene, name, given.folder))
 
 

@@ -170,9 +170,8 @@ def main() -> None:
     )  # fmt: skip
     size = (given.frames, given.resolution, given.iterations, given.intrinsics)
     rows = Rows(given.output, [] if given.again else kept_rows(given.output, Row))
-    done = {Case(*(getattr(row, name) for name in Case.__dataclass_fields__)) for row in rows}
     for case in (Case(a, b, c, *size) for b in given.seeds for c in given.noise for a in given.scenes):
-        if case not in done:
+        if not rows.have(**asdict(case)):
             rows.add(measure(case, given.folder))
     ones = np.array([row.within_1 for row in rows])
     inside = ((ones >= 0.6) & (ones <= 0.8)).sum()

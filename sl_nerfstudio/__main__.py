@@ -52,11 +52,9 @@ def _shown(name: str, part: Callable[[], str]) -> bool:
     try:
         print(paragraph(name, part()), flush=True)
         return True
-    except Missing as fault:
-        print(paragraph(name, f"error: {fault}"), flush=True)
-    except ImportError as error:  # of a package that was found missing above
-        print(paragraph(name, f"error: {last_line(error)}"), flush=True)
-    return False
+    except (Missing, ImportError) as fault:  # the latter of a package that was found missing above
+        print(paragraph(name, f"error: {fault if isinstance(fault, Missing) else last_line(fault)}"), flush=True)
+        return False
 
 
 def packages() -> str:

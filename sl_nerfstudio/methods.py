@@ -73,11 +73,7 @@ def _trainer(method_name: str, model: SLModelConfig, rays: int) -> SLTrainerConf
 
 
 sl_neus = MethodSpecification(
-    config=_trainer(
-        "sl-neus",
-        SLModelConfig(),
-        rays=4096,
-    ),
+    config=_trainer("sl-neus", SLModelConfig(), rays=4096),
     description="Surface and poses of a scan with a moving pattern projector; quick with or without a GPU. Usual: "
     "--data SCAN --output-dir DIR --timestamp NAME --max-num-iterations STEPS --pipeline.model.refine-poses "
     "{free,rigid-rig,known-rig,static-projector,off} --pipeline.model.refine-intrinsics True; all others can stay.",
@@ -85,11 +81,7 @@ sl_neus = MethodSpecification(
 
 
 sl_neus_paper = MethodSpecification(
-    config=_trainer(
-        "sl-neus-paper",
-        paper_model(),
-        rays=2024,
-    ),
+    config=_trainer("sl-neus-paper", paper_model(), rays=2024),
     description="The method of Furukawa, Nishihara and Kawasaki (2025), for comparison; three details differ: xyz as "
     "input, a rounded ReLU, coordinates divided by the accumulated weight. Poses move as "
     "--pipeline.model.camera-optimizer.mode and --pipeline.model.projector-optimizer.mode say: {SE3,SO3xR3,off}.",

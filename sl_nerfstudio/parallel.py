@@ -238,8 +238,7 @@ def one_torch_thread() -> Iterator[None]:
     """Operations of torch on one thread, our loops on all, for frequent calls: finding BLAS takes milliseconds."""
     global _ours
     before, count = _ours, torch.get_num_threads()
-    _ours = threads()
-    torch.set_num_threads(1)
+    torch_on_one_thread()
     try:
         yield
     finally:
@@ -300,10 +299,8 @@ def results(tasks: Sequence[Callable[[], T]]) -> list[T]:
 
 def both(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
     """What two tasks return; they run as in `parallel`."""
-    a: list[T] = []
-    b: list[U] = []
-    parallel([lambda: a.append(first()), lambda: b.append(second())])
-    return a[0], b[0]
+    found: list[Any] = results([first, second])
+    return found[0], found[1]
 
 
 def _work(tasks: Sequence[Callable[[], object]], queue: Iterator[int], many: bool) -> None:

@@ -138,7 +138,7 @@ def wait_for(said: str, stream: Terminal) -> None:
         time.sleep(0.01)
 
 
-def test_a_phase_prints_lines_where_there_is_no_terminal(monkeypatch, capsys):
+def test_a_phase_or_a_loop_alone_prints_lines_where_there_is_no_terminal(monkeypatch, capsys):
     log = io.StringIO()
     monkeypatch.setattr(sys, "stderr", log)
     monkeypatch.setattr(console, "PLAIN_SECONDS", 0.01)
@@ -152,6 +152,9 @@ def test_a_phase_prints_lines_where_there_is_no_terminal(monkeypatch, capsys):
     assert "train       3 of 100, coordinates to 0.5 px" in lines
     assert any(line.startswith("train       0 of 7, reading frames") for line in lines)
     assert capsys.readouterr().out == "train       100 steps\n"
+    for k in track(range(4), "rendering"):
+        wait_for(f"rendering   {k} of 4", log)
+    assert "rendering   3 of 4" in log.getvalue()
 
 
 def test_loops_and_phases_in_a_phase_are_its_progress_and_leave_it_as_it_was(monkeypatch, capsys):
@@ -170,15 +173,6 @@ def test_loops_and_phases_in_a_phase_are_its_progress_and_leave_it_as_it_was(mon
         console.say("4 of 4 frames")
         assert capsys.readouterr().out == ""  # the bar has the last line
     assert capsys.readouterr().out == "4 of 4 frames\n"
-
-
-def test_a_loop_alone_prints_lines_where_there_is_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    log = io.StringIO()
-    monkeypatch.setattr(sys, "stderr", log)
-    monkeypatch.setattr(console, "PLAIN_SECONDS", 0.01)
-    for k in track(range(4), "rendering"):
-        wait_for(f"rendering   {k} of 4", log)
-    assert "rendering   3 of 4" in log.getvalue()
 
 
 def test_a_phase_shows_a_bar_on_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

@@ -87,3 +87,14 @@ def test_imports_for_types_inside_functions_and_relative_ones_count():
     )
     found = set(imports(text, PACKAGE / "geometry" / "some.py"))
     assert found == {"typing", "sl_nerfstudio.scan.types", "sl_nerfstudio.errors", "sl_nerfstudio.geometry.lie"}
+
+
+def test_only_kernels_and_what_launches_them_import_triton() -> None:
+    """Machines without it use plain torch, and its import takes half a second."""
+    for path in MODULES:
+        if path.name.startswith("triton_") or path.name == "kernel_step.py":
+            continue
+        for node in ast.parse(path.read_text()).body:  # imports in functions are done when they are needed
+            names = [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            names += [name.name for name in node.names] if isinstance(node, ast.Import) else []
+            assert not [name for name in names if "triton" in name or name.endswith("kernel_step")], path

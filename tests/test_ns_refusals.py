@@ -54,21 +54,13 @@ def truncate(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
-# One of each kind; tests/scan has all faults, and that a training refuses what sl-check finds.
-FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
-    "truncated image": (lambda r: truncate(r / "images/frame_00001.png"), "images/frame_00001.png"),
-    "missing coords": (lambda r: (r / "coords/frame_00002.npz").unlink(), "coords/frame_00002.npz"),
-    "no transforms.json": (lambda r: (r / "transforms.json").unlink(), "transforms.json"),
-}
-
-
-@pytest.mark.parametrize("damage, named", FAULTS.values(), ids=FAULTS.keys())
-def test_bad_scans_do_not_start(tmp_path, refused, damage, named) -> None:
+def test_bad_scans_do_not_start(tmp_path, refused) -> None:
+    """tests/scan has all faults, and that a training refuses what sl-check finds."""
     root = TinyScan().write(tmp_path / "scan")
-    damage(root)
+    truncate(root / "images/frame_00001.png")
     message = refused(root)
     assert message.startswith("error: ") and str(root) in message
-    assert named in message and "remedy: " in message
+    assert "images/frame_00001.png" in message and "remedy: " in message
 
 
 def without_rays() -> Any:

@@ -1,10 +1,12 @@
-"""Guarantees of the whole package: entry points, commands and their help, dependencies, layers, no network."""
+"""Guarantees of the whole package: entry points, commands and their help, dependencies, no network; types."""
 
 import ast
 import dataclasses
 import importlib
 import importlib.metadata
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -27,8 +29,6 @@ IMPORTED_AS = {
     "opencv-python-headless": "cv2", "pillow": "PIL", "pygame-ce": "pygame", "pyyaml": "yaml",
     "lazy-loader": "lazy_loader", "pillow-heif": "pillow_heif", "scikit-image": "skimage",
 }  # fmt: skip
-# Declared without being imported here, each with the reason.
-NOT_IMPORTED: dict[str, str] = {}
 
 
 def distribution_name(requirement: str) -> str:
@@ -73,7 +73,7 @@ def test_imported_packages_are_the_declared_dependencies():
     imported = {name.split(".")[0] for names in IMPORTS.values() for name in names} - standard
     extras = [text for name, texts in PROJECT["optional-dependencies"].items()
               if name not in ("dev", "docs", "render") for text in texts]  # fmt: skip
-    declared = {distribution_name(text) for text in PROJECT["dependencies"] + extras} - NOT_IMPORTED.keys()
+    declared = {distribution_name(text) for text in PROJECT["dependencies"] + extras}
     assert imported == {IMPORTED_AS.get(name, name) for name in declared}
 
 
@@ -124,3 +124,29 @@ def config_classes() -> list[tuple[str, type]]:
             visit(entry["scheduler"])
     assert {"SLModelConfig", "SLDataManagerConfig", "SLDataParserConfig"} <= found.keys()
     return sorted(found.items())
+
+
+# ------------------------------------------------------------------ types
+
+
+_CALLS = """
+import tests.conftest
+import torch
+from sl_nerfstudio.geometry.lie import inverse
+inverse(torch.eye(4).expand(3, 4, 4))
+try:
+    inverse(torch.eye(3))
+except Exception as error:
+    print(type(error).__module__.split(".")[0])
+"""
+
+
+def test_a_wrong_shape_is_refused_only_where_types_are_checked():
+    def error_of(**environment: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-c", _CALLS], cwd=ROOT, env=os.environ | environment, capture_output=True, text=True
+        )
+        return done.stdout.strip()
+
+    assert error_of(SL_TYPE_CHECKS="1") == "jaxtyping"
+    assert error_of(SL_TYPE_CHECKS="") != "jaxtyping"

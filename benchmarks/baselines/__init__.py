@@ -1,4 +1,4 @@
-"""Methods to compare with: COLMAP, TSDF fusion after ICP and frame to model, Poisson's surface, window matching.
+"""Methods to compare with: COLMAP, TSDF fusion after ICP and frame to model, Poisson's surface.
 
-In: photographs, a scan with poses, or the nodes that the decoder found. Out: poses, a mesh, or matched nodes.
+In: photographs, or a scan with poses. Out: poses, or a mesh.
 """

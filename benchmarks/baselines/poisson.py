@@ -5,12 +5,11 @@ import open3d as o3d
 from scipy.spatial import KDTree
 
 from benchmarks.baselines.poses import oriented_cloud
-from benchmarks.baselines.tsdf import backprojected, depth_maps, largest_pieces, object_size
+from benchmarks.baselines.tsdf import UNIT_SIZE, backprojected, depth_maps, largest_pieces, object_size
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Scan
 
-_UNIT = 100.0  # the object is scaled to about this size
 _VOXEL = 1 / 250  # of the object's size: one point each, as fusion's voxels
 _DEPTH = 9  # of Poisson's octree
 _FARTHEST_VOXELS = 4.0  # from the points: Poisson's surface beyond was closed, not measured
@@ -19,7 +18,7 @@ _FARTHEST_VOXELS = 4.0  # from the points: Poisson's surface beyond was closed, 
 def poisson(scan: Scan, poses: DevicePoses) -> Mesh:
     """Poisson's surface (Open3D) of the triangulated points of all frames, where there are points."""
     depths = depth_maps(scan, poses)
-    unit, voxel = _UNIT / object_size(depths), _VOXEL * _UNIT
+    unit, voxel = UNIT_SIZE / object_size(depths), _VOXEL * UNIT_SIZE
     cloud = o3d.geometry.PointCloud()
     for depth, T in zip(depths, poses.T_world_camera, strict=True):
         scaled = T.copy()

@@ -8,7 +8,7 @@ import open3d as o3d
 from jaxtyping import Float
 from numpy import ndarray
 
-from benchmarks.baselines.tsdf import backprojected, depth_maps, object_size
+from benchmarks.baselines.tsdf import UNIT_SIZE, backprojected, depth_maps, object_size
 from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
 from sl_nerfstudio.console import track
 from sl_nerfstudio.dataparser.dataparser import load_scan
@@ -16,7 +16,6 @@ from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.model.pose_refinement import PriorConfig, adjust_scan
 from sl_nerfstudio.scan import Scan
 
-_SIZE = 100.0
 _VOXEL = 1 / 80  # lengths relative to the size of the object
 _DISTANCES = (0.08, 0.03, 0.015)  # of correspondence, coarse to fine
 _NEIGHBOURS = 8  # pairs of a frame: those whose cameras look in the most similar directions
@@ -26,15 +25,16 @@ _LEAST_OVERLAP = 0.3  # share of a cloud's points with a partner; pairs with a s
 def register(scan: Scan, poses: DevicePoses, rounds: int = 2) -> DevicePoses:
     """Poses after pairwise point-to-plane ICP and a pose graph over all overlapping pairs."""
     depths = depth_maps(scan, poses)
-    size = object_size(depths)
-    unit = _SIZE / size
+    unit = UNIT_SIZE / object_size(depths)
     start = poses.T_world_camera.copy()
     start[:, :3, 3] *= unit
-    clouds = [oriented_cloud(backprojected(d) * unit, T, _VOXEL * _SIZE) for d, T in zip(depths, start, strict=True)]
+    clouds = [
+        oriented_cloud(backprojected(d) * unit, T, _VOXEL * UNIT_SIZE) for d, T in zip(depths, start, strict=True)
+    ]
     motion = np.tile(np.eye(4), (len(clouds), 1, 1))
     for distances in (_DISTANCES, *[_DISTANCES[1:]] * (rounds - 1)):
         moved = [o3d.geometry.PointCloud(c).transform(T) for c, T in zip(clouds, motion, strict=True)]
-        step = _multiway(moved, motion @ start, [d * _SIZE for d in distances])
+        step = _multiway(moved, motion @ start, [d * UNIT_SIZE for d in distances])
         motion = step @ motion
     motion[:, :3, 3] /= unit
     return DevicePoses(motion @ poses.T_world_camera, motion @ poses.T_world_projector)
@@ -51,9 +51,7 @@ def oriented_cloud(p_camera: Float[ndarray, "n 3"], T: Float[ndarray, "4 4"], vo
 
 
 def _multiway(
-    clouds: Sequence[o3d.geometry.PointCloud],
-    T_world_camera: Float[ndarray, "n 4 4"],
-    distances: Sequence[float],
+    clouds: Sequence[o3d.geometry.PointCloud], T_world_camera: Float[ndarray, "n 4 4"], distances: Sequence[float]
 ) -> Float[ndarray, "n 4 4"]:
     """Motion of each cloud; the first one stays."""
     registration = o3d.pipelines.registration

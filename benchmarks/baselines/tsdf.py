@@ -8,12 +8,11 @@ import open3d as o3d
 import torch
 from jaxtyping import Bool, Float
 from numpy import ndarray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from sl_nerfstudio.console import track
 from sl_nerfstudio.geometry.devices import Y_Z_DOWN, Device, Intrinsics, project
 from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.geometry.numerics import component_labels
 from sl_nerfstudio.geometry.triangulation import pixel_centres, triangulate
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.scan import Frame, Scan
@@ -58,8 +57,7 @@ def drop_islands(depth: Float[ndarray, "h w"], step: float) -> Float[ndarray, "h
         _joined(index[:-1], index[1:], depth[:-1], depth[1:], step),
     ]
     a, b = np.concatenate(pairs, 1)
-    graph = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(h * w, h * w))
-    _, label = connected_components(graph, directed=False)
+    label = component_labels(a, b, h * w)
     large = np.bincount(label)[label].reshape(h, w) >= _LEAST_REGION * (depth > 0).sum()
     return np.where(large, depth, 0.0)
 

@@ -105,6 +105,10 @@ class Rows(list[T], Generic[T]):
         super().__init__(kept)
         self._output, self._settings = output, settings
 
+    def have(self, **values: Any) -> bool:
+        """Whether one of them has these values."""
+        return any(all(getattr(row, name) == value for name, value in values.items()) for row in self)
+
     def add(self, *rows: T, line: Callable[[T], str] = shown) -> None:
         """Append them, print a line for each, and write all."""
         self.extend(rows)

@@ -51,6 +51,13 @@ def made_once(config: "SynthConfig", parent: Path) -> "LoadedScan":
     return load_scan(folder)
 
 
+def scan_to_train_on(given: Path | None) -> Path:
+    """The scan that is given, or a small one, made once."""
+    from sl_nerfstudio.synthesis.config import SynthConfig
+
+    return given or made_once(SynthConfig(frames=4, resolution=96), Path("outputs/bench")).scan.root
+
+
 def with_true_poses(scan: Path, to: Path) -> Path:
     """A copy of a scan whose starting poses are the true ones."""
     shutil.copytree(scan, to)

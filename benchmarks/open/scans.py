@@ -27,13 +27,8 @@ _PHOTOGRAPHS = replace(_BASE, frames=14, resolution=500, images_only=True)
 class OpenScan:
     """One scan of the benchmark."""
 
-    name: str  # category-object
+    name: str  # what is hard about it, and the object
     config: SynthConfig
-
-    @property
-    def category(self) -> str:
-        """What is hard about it."""
-        return self.name.split("-")[0]
 
     @property
     def photographs(self) -> bool:

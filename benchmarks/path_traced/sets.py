@@ -134,11 +134,9 @@ def _render(one: PhotographSet, frames: int, resolution: int, quality: Quality, 
             picture, file = developed(light, camera.sensor, rng)
             (root / "images" / f"{name}.jpg").write_bytes(file)
             seen = visible_centres(FrameGeometry(caster, devices, *T))
-            lit, shape = seen.lit.reshape(picture.shape[:2]), picture.shape[:2]
-            coords = np.where(lit[..., None], seen.uv_projector.reshape(*shape, 2), np.nan).astype(np.float32)
-            truth.add_frame(_numbered(k), image=picture, coords=coords, mask=lit, T_world_camera=T[0],
-                            T_world_projector=T[1])  # fmt: skip
-            own = caster.on_object(seen.face).reshape(shape)
+            lit, own = (mask.reshape(picture.shape[:2]) for mask in (seen.lit, caster.on_object(seen.face)))
+            truth.add_frame(_numbered(k), image=picture, coords=seen.coords(devices.camera), mask=lit,
+                            T_world_camera=T[0], T_world_projector=T[1])  # fmt: skip
             truth.add_file(f"object_masks/{_numbered(k)}.png", encode_png(own.astype(np.uint8) * np.uint8(255)))
             say(f"{name}: {k + 1} of {frames}")
         usable = [{"name": _numbered(k), "usable": True, "fault": None} for k in range(frames)]

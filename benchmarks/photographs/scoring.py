@@ -16,11 +16,10 @@ import torch
 import trimesh
 from jaxtyping import Bool, Float, Float32, Float64
 from numpy import ndarray
-from scipy.spatial.transform import Rotation
 
 from benchmarks.photographs.sets import note_of
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
-from sl_nerfstudio.geometry.lie import Similarity, fit_similarity
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg, fit_similarity
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan import Frame, Scan, read_scan
 from sl_nerfstudio.scan.images import read_image
@@ -165,7 +164,7 @@ def pose_errors(found: Sequence[FoundFrame], truth: Truth) -> list[PoseError]:
 def group_sizes(found: Sequence[FoundFrame], truth: Truth) -> tuple[int, ...]:
     """Sizes of the groups into which frames fall whose cameras are turned rightly against each other, largest first."""
     turns = [truth.frames[f.name].frame.T_world_camera[:3, :3] @ f.T_world_camera[:3, :3].T for f in found]
-    near = np.array([[_turn_deg(a, b) <= WRONG_DEG for b in turns] for a in turns]).reshape(len(turns), len(turns))
+    near = np.array([[angle_deg(b.T @ a) <= WRONG_DEG for b in turns] for a in turns]).reshape(len(turns), len(turns))
     left, sizes = np.ones(len(turns), dtype=bool), []
     while left.any():
         group = near[(near & left).sum(1).argmax()] & left
@@ -230,12 +229,9 @@ def _fitted(group: Sequence[_Placed]) -> Similarity:
 
 def _error(placed: _Placed, S_truth_scan: Similarity, size: float) -> PoseError:
     found, true = placed.found, placed.true.frame
-    camera = _turn_deg(S_truth_scan.R @ found.T_world_camera[:3, :3], true.T_world_camera[:3, :3])
-    projector = _turn_deg(S_truth_scan.R @ found.T_world_projector[:3, :3], true.T_world_projector[:3, :3])
+    R = S_truth_scan.R
+    camera = angle_deg(true.T_world_camera[:3, :3].T @ R @ found.T_world_camera[:3, :3])
+    projector = angle_deg(true.T_world_projector[:3, :3].T @ R @ found.T_world_projector[:3, :3])
     shift = np.linalg.norm(S_truth_scan.points(placed.p_scan) - placed.p_true, axis=1)
     sigma = float("nan") if found.pose_sigma is None else found.pose_sigma.camera_rotation_deg
     return PoseError(found.name, camera, projector, float(np.median(shift)) / size, sigma)
-
-
-def _turn_deg(R: Float[ndarray, "3 3"], true: Float[ndarray, "3 3"]) -> float:
-    return float(np.degrees(Rotation.from_matrix(true.T @ R).magnitude()))

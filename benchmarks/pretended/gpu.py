@@ -331,7 +331,7 @@ class _Functions(TorchFunctionMode):
         if name in ("to", "cuda", "cpu") and args and isinstance(args[0], Tensor):
             return self._moved(func, name, args, kwargs)
         if name in ("tolist", "new_tensor") and isinstance(args[0], DeviceTensor):
-            return self._read_or_uploaded(func, name, args, kwargs)
+            return self._read_or_uploaded(name, args, kwargs)
         device = kwargs.get("device")
         if device is None:
             with self._gpu.working(tree_leaves((args, kwargs))):
@@ -376,7 +376,7 @@ class _Functions(TorchFunctionMode):
             return x
         return self._upload(x) if there else self._read(x)
 
-    def _read_or_uploaded(self, func: Callable[..., Any], name: str, args: Any, kwargs: Any) -> Any:
+    def _read_or_uploaded(self, name: str, args: Any, kwargs: Any) -> Any:
         if name == "tolist":
             self._gpu.wait("values read by the host")
             return args[0].values.tolist()

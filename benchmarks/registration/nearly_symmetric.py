@@ -18,7 +18,7 @@ import trimesh
 from numpy import ndarray
 
 from benchmarks.common.measuring import Rows, options
-from benchmarks.registration.solids import ball, block, drum, joined, meshed, moved, prism, without
+from benchmarks.registration.solids import ball, block, drum, meshed, moved, prism
 from sl_nerfstudio.geometry.lie import angle_deg
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration
@@ -26,6 +26,7 @@ from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
 from sl_nerfstudio.synthesis.config import SynthConfig
+from sl_nerfstudio.synthesis.sdf import carve, union
 from sl_nerfstudio.synthesis.synthesise import make_setup
 
 FRAMES, RESOLUTION = 24, 220
@@ -50,38 +51,38 @@ class Row:
 def key() -> trimesh.Trimesh:
     """A plate with two bosses of unequal height."""
     bosses = drum((32, 0, 14), 10, 20), drum((-32, 0, 12), 8, 12)
-    return meshed(joined(block((0, 0, 0), (100, 44, 24), 2), *bosses, blend=3), (60, 40, 40))
+    return meshed(union(3, block((0, 0, 0), (100, 44, 24), 2), *bosses), (60, 40, 40))
 
 
 def hub() -> trimesh.Trimesh:
     """Six sides, a hole, and a notch."""
     notch = moved(block((0, 0, 20), (30, 10, 8)), (34, 0, 0))
-    return meshed(without(prism(6, 34, 40), drum((0, 0, 0), 14, 80), notch), (46, 46, 40))
+    return meshed(carve(0.0, prism(6, 34, 40), drum((0, 0, 0), 14, 80), notch), (46, 46, 40))
 
 
 def cross() -> trimesh.Trimesh:
     """Two bars of unequal length, and a boss."""
     bars = block((0, 0, 0), (110, 24, 24), 2), block((0, 0, 0), (24, 84, 24), 2)
-    return meshed(joined(*bars, drum((45, 0, 12), 7, 14), blend=4), (64, 52, 44))
+    return meshed(union(4, *bars, drum((45, 0, 12), 7, 14)), (64, 52, 44))
 
 
 def finned() -> trimesh.Trimesh:
     """Three fins, of which one is thicker and lower; upside down it is the same."""
     sizes = (44, 13, 52), (44, 8, 60), (44, 8, 60)
     fins = [moved(block((38, 0, 0), size, 2), (0, 0, 0), 120.0 * k) for k, size in enumerate(sizes)]
-    return meshed(joined(drum((0, 0, 0), 24, 70), *fins, blend=5), (70, 70, 46))
+    return meshed(union(5, drum((0, 0, 0), 24, 70), *fins), (70, 70, 46))
 
 
 def peanut() -> trimesh.Trimesh:
     """Two lobes and a small third."""
     lobes = ball((30, 0, 0), 30), ball((-30, 0, 0), (33, 30, 28)), ball((40, 20, 14), 9)
-    return meshed(joined(*lobes, blend=18), (76, 50, 50))
+    return meshed(union(18, *lobes), (76, 50, 50))
 
 
 def mouse() -> trimesh.Trimesh:
     """An ellipsoid with two ears and a bump."""
     bumps = ball((38, 18, 14), 11), ball((38, -18, 14), 11), ball((-40, 12, 12), 9)
-    return meshed(joined(ball((0, 0, 0), (55, 32, 24)), *bumps, blend=8), (70, 50, 40))
+    return meshed(union(8, ball((0, 0, 0), (55, 32, 24)), *bumps), (70, 50, 40))
 
 
 def brick() -> trimesh.Trimesh:
@@ -91,30 +92,30 @@ def brick() -> trimesh.Trimesh:
 
 def bracket() -> trimesh.Trimesh:
     """An angle with holes and a rib."""
-    plates = joined(block((0, 0, -30), (100, 60, 10)), block((-45, 0, 5), (10, 60, 80)), blend=3)
-    rib = without(block((-25, 4, -8), (44, 8, 40)), moved(block((30, 0, 30), (90, 60, 60)), (-8, 0, 0), 0, -45))
+    plates = union(3, block((0, 0, -30), (100, 60, 10)), block((-45, 0, 5), (10, 60, 80)))
+    rib = carve(0.0, block((-25, 4, -8), (44, 8, 40)), moved(block((30, 0, 30), (90, 60, 60)), (-8, 0, 0), 0, -45))
     holes = [drum((x, y, -30), r, 30) for x, y, r in ((5, -16, 7), (34, 14, 9), (36, -18, 5))]
-    return meshed(without(joined(plates, rib), *holes, drum((-45, -8, 20), 11, 30, axis=0)), (62, 42, 56))
+    return meshed(carve(0.0, union(0.0, plates, rib), *holes, drum((-45, -8, 20), 11, 30, axis=0)), (62, 42, 56))
 
 
 def nut() -> trimesh.Trimesh:
     """Hexagonal, with a hole."""
-    return meshed(without(prism(6, 45, 38), drum((0, 0, 0), 26, 60), ball((0, 0, 52), 40)), (58, 58, 26))
+    return meshed(carve(0.0, prism(6, 45, 38), drum((0, 0, 0), 26, 60), ball((0, 0, 52), 40)), (58, 58, 26))
 
 
 def housing() -> trimesh.Trimesh:
     """A bearing block: bore, feet with holes, bosses of unequal height, a rib, an oil cup."""
-    body = joined(block((0, 0, -28), (116, 46, 16), 2), drum((0, 0, 4), 32, 40, axis=1), blend=6)
-    ribs = joined(block((30, 0, -10), (40, 7, 30), 1), block((-30, 6, -12), (36, 6, 24), 1))
-    bosses = joined(
-        drum((46, 12, -14), 9, 22), drum((-46, -10, -18), 8, 12), drum((-44, 12, -16), 6, 20), drum((8, 0, 38), 8, 24),
-        blend=2,
+    body = union(6, block((0, 0, -28), (116, 46, 16), 2), drum((0, 0, 4), 32, 40, axis=1))
+    ribs = union(0.0, block((30, 0, -10), (40, 7, 30), 1), block((-30, 6, -12), (36, 6, 24), 1))
+    bosses = union(
+        2, drum((46, 12, -14), 9, 22), drum((-46, -10, -18), 8, 12), drum((-44, 12, -16), 6, 20),
+        drum((8, 0, 38), 8, 24),
     )  # fmt: skip
     holes = [
         drum((0, 0, 4), 19, 80, axis=1), drum((46, 12, -14), 4, 80), drum((-46, -10, -18), 4, 80),
         drum((8, 0, 46), 4, 20),
     ]  # fmt: skip
-    return meshed(without(joined(body, ribs, bosses, blend=2), *holes), (64, 34, 56))
+    return meshed(carve(0.0, union(2, body, ribs, bosses), *holes), (64, 34, 56))
 
 
 THINGS: dict[str, Callable[[], trimesh.Trimesh]] = {

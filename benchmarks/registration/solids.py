@@ -1,4 +1,4 @@
-"""Solids from formulas, how they are joined and meshed. Lengths in mm, z is up."""
+"""Solids from formulas, and how they are meshed. Lengths in mm, z is up."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,7 +8,7 @@ from numpy import ndarray
 from skimage.measure import marching_cubes
 
 Solid = Callable[[ndarray], ndarray]
-"""Signed distance of points (..., 3), negative inside; may be a bound instead of the distance itself."""
+"""Signed distance of points (n, 3), negative inside; may be a bound instead of the distance itself."""
 
 
 def ball(centre: Sequence[float], radii: float | Sequence[float]) -> Solid:
@@ -17,14 +17,12 @@ def ball(centre: Sequence[float], radii: float | Sequence[float]) -> Solid:
     return lambda p: (np.linalg.norm((p - np.asarray(centre)) / r, axis=-1) - 1) * r.min()
 
 
-def block(centre: Sequence[float], sides: Sequence[float], rounding: float = 0.5, turn_deg: float = 0.0) -> Solid:
-    """A box with rounded edges, turned about the vertical through its centre."""
+def block(centre: Sequence[float], sides: Sequence[float], rounding: float = 0.5) -> Solid:
+    """A box with rounded edges."""
     half = np.asarray(sides, dtype=float) / 2 - rounding
-    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
 
     def distance(p: ndarray) -> ndarray:
-        x, y, z = np.moveaxis(p - np.asarray(centre), -1, 0)
-        q = np.abs(np.stack([c * x + s * y, c * y - s * x, z], -1)) - half
+        q = np.abs(p - np.asarray(centre)) - half
         return np.linalg.norm(np.maximum(q, 0), axis=-1) + np.minimum(q.max(-1), 0) - rounding
 
     return distance
@@ -61,37 +59,12 @@ def moved(solid: Solid, shift: Sequence[float], turn_deg: float = 0.0, tilt_deg:
     return lambda p: solid((p - np.asarray(shift)) @ (turn @ tilt))
 
 
-def joined(*solids: Solid, blend: float = 0.0) -> Solid:
-    """The union; with `blend`, of its size in mm, the seams are rounded."""
-
-    def distance(p: ndarray) -> ndarray:
-        result = solids[0](p)
-        for solid in solids[1:]:
-            other = solid(p)
-            h = np.maximum(blend - np.abs(result - other), 0) / max(blend, 1e-9)
-            result = np.minimum(result, other) - h * h * blend / 4
-        return result
-
-    return distance
-
-
-def without(solid: Solid, *holes: Solid) -> Solid:
-    """What is left of a solid."""
-
-    def distance(p: ndarray) -> ndarray:
-        result = solid(p)
-        for hole in holes:
-            result = np.maximum(result, -hole(p))
-        return result
-
-    return distance
-
-
 def meshed(solid: Solid, half: Sequence[float], voxel: float = 0.8) -> trimesh.Trimesh:
     """Marching cubes in a box from -half to half. Raises ValueError if the solid leaves the box."""
     axes = [np.arange(-h, h + voxel, voxel) for h in half]
-    slabs = [solid(np.stack(np.meshgrid(x, *axes[1:], indexing="ij"), -1))[0] for x in axes[0][:, None]]
-    values = np.stack(slabs).astype(np.float32)
+    shape = len(axes[1]), len(axes[2])
+    slabs = [np.stack(np.meshgrid(x, *axes[1:], indexing="ij"), -1).reshape(-1, 3) for x in axes[0][:, None]]
+    values = np.stack([solid(slab).reshape(shape) for slab in slabs]).astype(np.float32)
     rims = (values[[0, -1]], values[:, [0, -1]], values[:, :, [0, -1]])
     if any(rim.min() <= 0 for rim in rims):
         raise ValueError("the solid does not fit into its box")

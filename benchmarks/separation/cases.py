@@ -15,14 +15,8 @@ from sl_nerfstudio.geometry.triangulation import epipolar_residual
 from sl_nerfstudio.object_separation.planes import DecodedFrame
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.synthesis.config import SynthConfig
-from sl_nerfstudio.synthesis.devices import (
-    CoordinateNoise,
-    DevicePair,
-    disturb_coords,
-    make_devices,
-    make_paths,
-)
-from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, above_the_table, visible_points
+from sl_nerfstudio.synthesis.devices import CoordinateNoise, DevicePair, disturb_coords, make_devices, make_paths
+from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, above_the_table, visible_centres
 from sl_nerfstudio.synthesis.sdf import Scene
 from sl_nerfstudio.synthesis.synthesise import make_cells
 
@@ -64,12 +58,10 @@ def make_case(scene: Scene, background: str, given: Conditions) -> Case:
     devices = DevicePair(camera, projector)
     cells = make_cells(layout.render(), layout.lattice)
     noise = CoordinateNoise(given.noise_px, 0.15, 0.02)
-    uv = np.stack(np.meshgrid(np.arange(camera.w), np.arange(camera.h)), -1).reshape(-1, 2) + 0.5
     frames, objects = [], []
     for T_c, T_p in zip(poses.T_world_camera, poses.T_world_projector, strict=True):
-        found = visible_points(FrameGeometry(caster, devices, T_c, T_p), uv)
-        mask = found.lit.reshape(camera.h, camera.w)
-        exact = np.where(mask[..., None], found.uv_projector.reshape(*mask.shape, 2), np.nan).astype(np.float32)
+        found = visible_centres(FrameGeometry(caster, devices, T_c, T_p))
+        mask, exact = found.lit.reshape(camera.h, camera.w), found.coords(camera)
         exact_frame = DecodedFrame(camera, projector, T_c, T_p, disturb_coords(exact, mask, cells, noise, rng), mask)
         wrong = _wrong_pose(T_c[:3, 3], scene.centre, given.pose_deg, rng)
         frames.append(replace(

@@ -416,34 +416,27 @@ def judge_plane(
     centres = np.stack([frame.T_world_camera[:3, 3] for frame in frames])
     if (plane.heights(centres) > 0).mean() < 0.5:
         plane = plane.flipped()
-    return PlaneFinding(plane, share, _verdict(plane, pool, frames, points, region))
 
+    def verdict() -> Verdict:
+        p = pool.points.p_world
+        height, clear = plane.heights(p), CLEAR_SIGMAS * pool.points.sigma_along(plane.normal)
+        inside = region.contains(p)
+        behind, above = ((side & inside).sum() / max(inside.sum(), 1) for side in (height < -clear, height > clear))
+        if (plane.heights(centres) > 0).mean() < _CAMERAS_IN_FRONT:
+            return "cameras on both sides"
+        if behind > _MOST_BEHIND:
+            return "surface behind it"
+        if above < _LEAST_ABOVE:
+            return "nothing on it"
+        on = p[pool.on(plane)]
+        if _continues(plane, on, frames, points) >= _CONTINUES:
+            return "leaves the views"
+        area, tall, around = _what_stands_on_it(plane, on, p[inside & (height > clear)], region)
+        if area >= _SUPPORT_AREA and tall >= _SUPPORT_HEIGHT and around >= _AROUND:
+            return "object stands on it"
+        return "edges seen"
 
-def _verdict(
-    plane: Plane,
-    pool: PointPool,
-    frames: Sequence[DecodedFrame],
-    points: Sequence[FramePoints],
-    region: ViewedRegion,
-) -> Verdict:
-    centres = np.stack([frame.T_world_camera[:3, 3] for frame in frames])
-    p = pool.points.p_world
-    height, clear = plane.heights(p), CLEAR_SIGMAS * pool.points.sigma_along(plane.normal)
-    inside = region.contains(p)
-    behind, above = (float((side & inside).sum() / max(inside.sum(), 1)) for side in (height < -clear, height > clear))
-    if (plane.heights(centres) > 0).mean() < _CAMERAS_IN_FRONT:
-        return "cameras on both sides"
-    if behind > _MOST_BEHIND:
-        return "surface behind it"
-    if above < _LEAST_ABOVE:
-        return "nothing on it"
-    on = p[pool.on(plane)]
-    if _continues(plane, on, frames, points) >= _CONTINUES:
-        return "leaves the views"
-    area, tall, around = _what_stands_on_it(plane, on, p[inside & (height > clear)], region)
-    if area >= _SUPPORT_AREA and tall >= _SUPPORT_HEIGHT and around >= _AROUND:
-        return "object stands on it"
-    return "edges seen"
+    return PlaneFinding(plane, share, verdict())
 
 
 def _continues(
@@ -511,13 +504,10 @@ def _what_stands_on_it(
     directions in which the plane extends beyond it.
     """
     size = region.radius / _CELLS
-    axes = plane.axes()
 
     def cells(p: Float[ndarray, "k 3"]) -> Int64[ndarray, "c 2"]:
-        cell, count = np.unique(
-            np.floor((p - region.focus) @ axes.T / size).astype(np.int64), axis=0, return_counts=True
-        )
-        return cell[count >= _POINTS_IN_CELL]
+        cell, place = _cells(plane, p - region.focus, size)
+        return cell[np.bincount(place, minlength=len(cell)) >= _POINTS_IN_CELL]
 
     standing, bare = cells(above), cells(on)
     if not len(standing) or not len(bare):

@@ -7,7 +7,6 @@ surroundings, or behind one, is left out; of the rest, the connected part on whi
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from itertools import product
 
 import numpy as np
 import torch
@@ -121,23 +120,7 @@ def _occupied(frames: Sequence[Float[ndarray, "_n 3"]], size: float) -> Int64[nd
 
 def _connected(voxels: Int64[ndarray, "v 3"]) -> Int64[ndarray, "v"]:
     """The connected part of each voxel, by its number."""
-    low, span = voxels.min(0) - _REACH, np.ptp(voxels, axis=0) + 2 * _REACH + 1
-
-    def key(v: Int64[ndarray, "v 3"]) -> Int64[ndarray, "v"]:
-        x, y, z = (v - low).T
-        return (x * span[1] + y) * span[2] + z
-
-    order = np.argsort(key(voxels))
-    keys = key(voxels)[order]
-    pairs = []
-    for step in product(range(-_REACH, _REACH + 1), repeat=3):
-        if step <= (0, 0, 0):
-            continue  # each pair once
-        there = key(voxels + np.array(step))
-        place = np.searchsorted(keys, there).clip(max=len(keys) - 1)
-        found = keys[place] == there
-        pairs.append(np.stack([np.flatnonzero(found), order[place[found]]]))
-    a, b = np.concatenate(pairs, 1)
+    a, b = KDTree(voxels).query_pairs(_REACH, p=np.inf, output_type="ndarray").T
     return component_labels(a, b, len(voxels))
 
 
@@ -199,7 +182,6 @@ class Surroundings:
 class Separation:
     """Decision which pixels and points belong to the object."""
 
-    region: ViewedRegion
     findings: tuple[PlaneFinding, ...]  # all planes that were judged
     surroundings: tuple[Surroundings, ...]  # those that are left out
     voxels: ObjectVoxels
@@ -264,7 +246,7 @@ def separate(frames: Sequence[DecodedFrame], seed: int = 0) -> Separation:
         voxels = find_object(rest, [], region, size)
     p_object = np.concatenate([p[voxels.contain(p)] for p in rest])
     p_object = p_object[_spread(len(p_object), _SILHOUETTE_POINTS, rng)]
-    return Separation(region, findings, tuple(outside), voxels, p_object)
+    return Separation(findings, tuple(outside), voxels, p_object)
 
 
 def _spread(count: int, most: int, rng: np.random.Generator) -> ndarray:

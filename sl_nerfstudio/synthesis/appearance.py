@@ -89,7 +89,6 @@ def draw_log(rng: np.random.Generator, bounds: Range) -> float:
 
 Texture = Callable[[Float32[ndarray, "n 3"]], Float32[ndarray, "n"]]
 TextureMaker = Callable[[float, np.random.Generator], Texture]
-_TEXTURE_WAVES = 12
 
 
 def blotches(size: float, rng: np.random.Generator) -> Texture:
@@ -186,15 +185,15 @@ TEXTURES: dict[str, TextureMaker] = {
 }
 
 
-def _waves(size: float, lengths: tuple[float, float], rng: np.random.Generator) -> Texture:
+def _waves(size: float, lengths: Range, rng: np.random.Generator, count: int = 12) -> Texture:
     """A smooth random function with mean 0 and standard deviation 1; wavelengths in sizes of the object."""
     shortest, longest = np.log(lengths)
-    wavelength = size * np.exp(rng.uniform(shortest, longest, _TEXTURE_WAVES))
-    direction = rng.normal(size=(_TEXTURE_WAVES, 3))
+    wavelength = size * np.exp(rng.uniform(shortest, longest, count))
+    direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     k = (direction * (2 * np.pi / wavelength)[:, None]).T.astype(np.float32)
-    phase = rng.uniform(0, 2 * np.pi, _TEXTURE_WAVES).astype(np.float32)
-    return lambda p: np.cos(p @ k + phase).sum(-1) * np.float32(np.sqrt(2 / _TEXTURE_WAVES))
+    phase = rng.uniform(0, 2 * np.pi, count).astype(np.float32)
+    return lambda p: np.cos(p @ k + phase).sum(-1) * np.float32(np.sqrt(2 / count))
 
 
 def _directions(rng: np.random.Generator) -> Float32[ndarray, "3 3"]:
@@ -272,13 +271,7 @@ def make_material(
         layers.append(Layer(texture, (1 - taken).astype(np.float32)))
     brightness = draw(rng, ranges.brightness)
     base = tint(0.25, rng) * np.float32(brightness)
-    return Material(
-        centre,
-        base,
-        tuple(layers),
-        draw(rng, ranges.gloss),
-        draw_log(rng, ranges.gloss_exponent),
-    )
+    return Material(centre, base, tuple(layers), draw(rng, ranges.gloss), draw_log(rng, ranges.gloss_exponent))
 
 
 def tint(strength: float, rng: np.random.Generator) -> Float32[ndarray, "3"]:
@@ -294,19 +287,26 @@ _LAMP_SHARE = (0.3, 0.7)  # of the room's light that comes from one lamp
 
 
 @dataclass(frozen=True)
-class DefocusedPattern:
+class Defocus:
+    """Blur of a thin lens by distance; lengths in millimetres, sigmas in pixels of the device."""
+
+    in_focus: float
+    out_of_focus: float  # added in quadrature at `reach` from the focal plane
+    focus: float  # distance of the focal plane
+    reach: float
+    largest: float
+
+    def sigma(self, distance: Float[ndarray, "*n"]) -> Float32[ndarray, "*n"]:
+        """Blur at a distance: it grows with the difference of the inverse distances; NaN, nothing there, is far."""
+        off = (self.focus / np.where(np.isfinite(distance), distance, 2 * self.focus) - 1) * self.focus / self.reach
+        return np.minimum(np.hypot(self.in_focus, self.out_of_focus * off), self.largest).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class DefocusedPattern(Defocus):
     """The pattern blurred more and more; between two levels, values are interpolated."""
 
     levels: Float32[ndarray, "k h w"]
-    in_focus: float  # sigma, pattern pixels
-    out_of_focus: float  # sigma added in quadrature at `reach` from the focal plane, pattern pixels
-    focus: float  # distance of the focal plane, millimetres
-    reach: float
-
-    def sigma(self, distance: Float[ndarray, "n"]) -> Float32[ndarray, "n"]:
-        """Blur at a distance; the blur circle of a thin lens grows with the difference of the inverse distances."""
-        off = (self.focus / distance - 1) * self.focus / self.reach
-        return np.minimum(np.hypot(self.in_focus, self.out_of_focus * off), _DEFOCUS_LEVELS[-1]).astype(np.float32)
 
     def sample(self, uv: Float[ndarray, "n 2"], distance: Float[ndarray, "n"]) -> Float32[ndarray, "n"]:
         """Pattern values in [0, 1] at pattern pixels, as thrown onto surfaces at distances from the projector."""
@@ -328,6 +328,12 @@ class DefocusedPattern:
         return above * (1 - fy) + below * fy
 
 
+def corner_fall_off(uv: Float[ndarray, "n 2"], projector: Device, corner_loss: float) -> Float[ndarray, "n"]:
+    """Strength of a lamp at pattern pixels: 1 in the middle, 1 - `corner_loss` in the corners."""
+    middle, half = np.array([projector.w, projector.h]) / 2, np.hypot(projector.w, projector.h) / 2
+    return 1 - corner_loss * ((uv - middle) ** 2).sum(-1) / half**2
+
+
 @dataclass(frozen=True)
 class Lamp:
     """The projector's lamp."""
@@ -341,8 +347,7 @@ class Lamp:
         self, uv: Float[ndarray, "n 2"], distance: Float[ndarray, "n"], projector: Device
     ) -> Float32[ndarray, "n"]:
         """Light on a surface that faces the lamp, by the inverse-square law and the fall-off to the corners."""
-        middle, half = np.array([projector.w, projector.h]) / 2, np.hypot(projector.w, projector.h) / 2
-        fall_off = 1 - self.corner_loss * ((uv - middle) ** 2).sum(-1) / half**2
+        fall_off = corner_fall_off(uv, projector, self.corner_loss)
         return (fall_off * (self.reference_distance / distance) ** 2).astype(np.float32)
 
     def through_pattern(self, value: Float32[ndarray, "n"]) -> Float32[ndarray, "n"]:
@@ -375,11 +380,12 @@ def make_pattern(
         *(cv2.GaussianBlur(pattern, (0, 0), float(s), borderType=cv2.BORDER_REPLICATE) for s in _DEFOCUS_LEVELS[1:]),
     ]
     return DefocusedPattern(
-        np.stack(blurred).astype(np.float32),
         draw(rng, ranges.pattern_blur),
         draw(rng, ranges.pattern_defocus),
         distance + size * rng.uniform(-0.35, 0.35),
         0.5 * size,
+        float(_DEFOCUS_LEVELS[-1]),
+        np.stack(blurred).astype(np.float32),
     )
 
 
@@ -405,20 +411,8 @@ _BLUR_LEVELS = 5  # blurred images between which each pixel is interpolated
 _REFERENCE_WIDTH = 600  # pixels, of the image that the ranges are given for
 
 
-@dataclass(frozen=True)
-class Lens:
-    """Blur by depth; lengths in millimetres, sigmas in pixels."""
-
-    in_focus: float
-    out_of_focus: float  # added in quadrature at `reach` from the focal plane
-    focus: float
-    reach: float
-    largest: float
-
-    def sigma(self, depth: Float[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
-        """Blur at a depth; NaN where nothing is, which is far away."""
-        off = (self.focus / np.where(np.isfinite(depth), depth, 2 * self.focus) - 1) * self.focus / self.reach
-        return np.minimum(np.hypot(self.in_focus, self.out_of_focus * off), self.largest).astype(np.float32)
+class Lens(Defocus):
+    """The camera's."""
 
     def blurred(self, image: Float32[ndarray, "h w 3"], depth: Float[ndarray, "h w"]) -> Float32[ndarray, "h w 3"]:
         """Each pixel from an image blurred as its depth demands: exact where the depth is the same all around."""
@@ -506,16 +500,13 @@ def make_look(
 
 # Plain images: one grey matte surface.
 
-_ALBEDO_WAVES = 14
-
 
 @dataclass(frozen=True)
 class Appearance:
     """A matte surface with faint blotches, weak room light, a lamp that fades towards the corners, a slight blur."""
 
     reference_distance: float  # millimetres: where the lamp has unit strength
-    wave_vectors: Float[ndarray, "k 3"]
-    wave_phases: Float[ndarray, "k"]
+    blotches: Texture  # from some millimetres to the size of the object
     mean_albedo: float = 0.78
     albedo_contrast: float = 0.16
     room_light: float = 0.08
@@ -525,10 +516,9 @@ class Appearance:
     blur: float = 0.55  # sigma of the lens, pixels
 
     def albedo(self, p_world: Float[ndarray, "n 3"]) -> Float32[ndarray, "n"]:
-        """Share of light reflected: smooth random blotches from some millimetres to the size of the object."""
-        angle = p_world.astype(np.float32) @ self.wave_vectors.T.astype(np.float32)
-        texture = np.cos(angle + self.wave_phases.astype(np.float32)).sum(-1) * np.sqrt(2 / _ALBEDO_WAVES)
-        return np.clip(self.mean_albedo * (1 + self.albedo_contrast * texture), 0.25, 1.0).astype(np.float32)
+        """Share of light reflected."""
+        blotches = self.blotches(p_world.astype(np.float32))
+        return np.clip(self.mean_albedo * (1 + self.albedo_contrast * blotches), 0.25, 1.0).astype(np.float32)
 
     def ambient(self, normal: Float32[ndarray, "n 3"]) -> Float32[ndarray, "n"]:
         """Light from the room, stronger from above."""
@@ -538,11 +528,6 @@ class Appearance:
         """Light of the projector for a pattern value in [0, 1]."""
         return np.float32(self.dark_leak) + np.float32(1 - self.dark_leak) * intensity
 
-    def projector_fall_off(self, uv: Float[ndarray, "n 2"], projector: Device) -> Float[ndarray, "n"]:
-        """Strength of the lamp across the pattern: 1 in the middle."""
-        middle, half = np.array([projector.w, projector.h]) / 2, np.hypot(projector.w, projector.h) / 2
-        return 1 - self.corner_loss * ((uv - middle) ** 2).sum(-1) / half**2
-
     def through_lens(self, image: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
         """The image as blurred by the lens."""
         return gaussian_filter(image, self.blur, truncate=4.0).astype(np.float32)
@@ -550,11 +535,4 @@ class Appearance:
 
 def make_appearance(scene: Scene, distance: float, rng: np.random.Generator) -> Appearance:
     """A random texture in proportion to the object."""
-    wavelength = scene.size * np.exp(rng.uniform(np.log(0.08), np.log(0.9), _ALBEDO_WAVES))
-    direction = rng.normal(size=(_ALBEDO_WAVES, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    return Appearance(
-        reference_distance=distance,
-        wave_vectors=direction * (2 * np.pi / wavelength)[:, None],
-        wave_phases=rng.uniform(0, 2 * np.pi, _ALBEDO_WAVES),
-    )
+    return Appearance(distance, _waves(scene.size, (0.08, 0.9), rng, 14))

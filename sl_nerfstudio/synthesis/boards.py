@@ -1,6 +1,5 @@
 """Photographs of a calibration board under a pattern, with their truth: `sl-synth --scene chessboard`."""
 
-import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -20,7 +19,7 @@ from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import PatternLayout
 from sl_nerfstudio.scan.images import encode_png
-from sl_nerfstudio.scan.write import device_fields
+from sl_nerfstudio.scan.write import device_fields, encode_json
 from sl_nerfstudio.storage import NewFolder
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import DevicePair
@@ -42,8 +41,7 @@ class BoardScene:
     """Both devices, and the board in every pose; boards have x to the right, y up, and z = 0, in millimetres."""
 
     board: Board
-    camera: Device
-    projector: Device
+    devices: DevicePair
     T_projector_camera: Float64[ndarray, "4 4"]
     T_camera_board: Float64[ndarray, "n 4 4"]
 
@@ -72,7 +70,7 @@ def make_board_scene(board: Board, devices: DevicePair, poses: int, rng: np.rand
         if _inside(camera, T, p_board).all() and _inside(projector, T_projector_camera @ T, p_board).all():
             found.append(T)
             if len(found) == poses:
-                return BoardScene(board, camera, projector, T_projector_camera, np.array(found))
+                return BoardScene(board, devices, T_projector_camera, np.array(found))
     raise AssertionError("the devices see no common volume")
 
 
@@ -139,7 +137,7 @@ class BoardPhotographer:
             yield self._exposed(albedo * (_ROOM_LIGHT + _LAMP * lit), rng)
 
     def _exposed(self, light: Float32[ndarray, "hs ws"], rng: np.random.Generator) -> UInt8[ndarray, "h w"]:
-        camera = self.scene.camera
+        camera = self.scene.devices.camera
         image = cv2.resize(light, (camera.w, camera.h), interpolation=cv2.INTER_AREA)
         image = cv2.GaussianBlur(image, (0, 0), _CAMERA_BLUR)
         noisy = image / _WHITE + self.noise * rng.standard_normal(image.shape).astype(np.float32)
@@ -149,7 +147,7 @@ class BoardPhotographer:
         self, T_camera_board: Float64[ndarray, "4 4"]
     ) -> tuple[Float32[ndarray, "hs ws"], Float32[ndarray, "hs ws 2"]]:
         """Albedo, and pattern coordinates, of every supersampled pixel."""
-        camera, s = self.scene.camera, self.supersampling
+        camera, s = self.scene.devices.camera, self.supersampling
         x, y = np.meshgrid((np.arange(camera.w * s) + 0.5) / s, (np.arange(camera.h * s) + 0.5) / s)
         rays = unproject(Intrinsics.of(camera, torch.float64), torch.from_numpy(np.stack([x, y], -1))).numpy()
         R, t = T_camera_board[:3, :3], T_camera_board[:3, 3]
@@ -158,7 +156,7 @@ class BoardPhotographer:
         p_board = (p_camera - t) @ R
         T = self.scene.T_projector_camera
         p_projector = torch.from_numpy(p_camera @ T[:3, :3].T + T[:3, 3])
-        uv, in_front = project(Intrinsics.of(self.scene.projector, torch.float64), p_projector)
+        uv, in_front = project(Intrinsics.of(self.scene.devices.projector, torch.float64), p_projector)
         seen = in_front.numpy() & (depth > 0)
         lookup = np.where(seen[..., None], uv.numpy(), -1e4).astype(np.float32)
         return _albedo(self.scene.board, p_board), lookup
@@ -216,12 +214,11 @@ def write_photographs(folder: NewFolder, photographer: BoardPhotographer, layout
             folder.write(f"images/pose_{pose:02d}/{k:02d}.png", encode_png(image))
     truth = {
         "units": "mm",
-        "camera": device_fields(scene.camera, "model"),
-        "projector": device_fields(scene.projector, "model"),
+        **{name: device_fields(device, "model") for name, device in vars(scene.devices).items()},
         "T_projector_camera": scene.T_projector_camera.tolist(),
         "T_camera_board": scene.T_camera_board.tolist(),
     }
-    folder.write("ground_truth/intrinsics.json", (json.dumps(truth, indent=1) + "\n").encode())
+    folder.write("ground_truth/intrinsics.json", encode_json(truth))
 
 
 def _shown(layout: PatternLayout) -> list[UInt8[ndarray, "h w"]]:

@@ -1,5 +1,6 @@
 """Devices that fit a scene, their paths around it, and the errors of poses, coordinates and images."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -91,20 +92,22 @@ def make_paths(scene: Scene, frames: int, kind: PathKind, rng: np.random.Generat
     laps = 0.5 if kind == "half-turn" else float(max(1, round(frames / _FRAMES_A_LAP)))
     camera = _around_the_object(scene, t, laps, rng)
     if kind == "rigid-rig":
-        T_camera_projector = _rig(scene)
-        return DevicePoses(camera, camera @ T_camera_projector)
+        return DevicePoses(camera, camera @ _rig(scene))
     return DevicePoses(camera, _beside(scene, camera, t, rng))
 
 
 def look_at(
-    position: Float[ndarray, "*n 3"], target: Float[ndarray, "*#n 3"], roll: Float[ndarray, "*n"]
+    position: Float[ndarray, "*n 3"],
+    target: Float[ndarray, "*#n 3"],
+    roll: Float[ndarray, "*n"],
+    up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> Float64[ndarray, "*n 4 4"]:
     """Pose of a device at `position` that looks at `target`; `roll` (radians) rotates it about its axis."""
     back = position - target
     back = back / np.linalg.norm(back, axis=-1, keepdims=True)
     # looking straight up or down, any horizontal direction may be "up"
-    up = np.where(np.abs(back[..., 2:]) > 0.999, [0.0, 1.0, 0.0], [0.0, 0.0, 1.0])
-    right = np.cross(up, back)
+    upwards = np.where(np.abs(back @ up)[..., None] > 0.999, [0.0, 1.0, 0.0], up)
+    right = np.cross(upwards, back)
     right = right / np.linalg.norm(right, axis=-1, keepdims=True)
     above = np.cross(back, right)
     c, s = np.cos(roll)[..., None], np.sin(roll)[..., None]
@@ -183,16 +186,8 @@ def _tilt(
 
 def _rig(scene: Scene) -> Float64[ndarray, "4 4"]:
     """The projector relative to the camera: to the right and slightly above, aimed at the object."""
-    distance = DISTANCE * scene.size
-    position = np.array([1.0, 0.25, 0.0]) * scene.size
-    T = np.eye(4)
-    back = position - np.array([0.0, 0.0, -distance])
-    back = back / np.linalg.norm(back)
-    right = np.cross([0.0, 1.0, 0.0], back)
-    right = right / np.linalg.norm(right)
-    T[:3, :3] = np.stack([right, np.cross(back, right), back], -1)
-    T[:3, 3] = position
-    return T
+    position, target = (np.array(p) * scene.size for p in ((1.0, 0.25, 0.0), (0.0, 0.0, -DISTANCE)))
+    return look_at(position, target, np.zeros(()), up=(0.0, 1.0, 0.0))
 
 
 def _about_a_projector(scene: Scene, t: Float[ndarray, "n"], rng: np.random.Generator) -> DevicePoses:
@@ -277,8 +272,7 @@ def disturb_relative(
     """Auto-calibration errors. Those of the logarithms of the lengths have mean zero."""
     n = len(T_camera_projector)
     out = T_camera_projector.copy()
-    turn = _rotations(np.radians(noise.relative_rotation_deg), n, rng)
-    out[:, :3, :3] = T_camera_projector[:, :3, :3] @ turn
+    out[:, :3, :3] = T_camera_projector[:, :3, :3] @ _rotations(np.radians(noise.relative_rotation_deg), n, rng)
     baseline = T_camera_projector[:, :3, 3]
     swing = np.cross(baseline, rng.standard_normal((n, 3)))  # about axes perpendicular to the baseline
     swing = swing / np.linalg.norm(swing, axis=1, keepdims=True) * np.abs(rng.standard_normal((n, 1)))

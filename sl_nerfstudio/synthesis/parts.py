@@ -67,9 +67,7 @@ def knob(rng: np.random.Generator) -> Part:
     radius, skirt, height, depth = rng.uniform((25, 5, 26, 1.0), (31, 9, 36, 1.8))
     flutes = int(rng.choice([0, 10, 12]))
     body = union(
-        1.0,
-        cylinder((0, 0, 0), (0, 0, 7), radius + skirt, 1.5),
-        cylinder((0, 0, 2), (0, 0, height), radius, 3),
+        1.0, cylinder((0, 0, 0), (0, 0, 7), radius + skirt, 1.5), cylinder((0, 0, 2), (0, 0, height), radius, 3)
     )
     if flutes:
         groove = cylinder((radius + 2.0, 0, 11), (radius + 2.0, 0, height + 9), 3.5)

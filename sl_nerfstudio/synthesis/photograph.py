@@ -16,6 +16,7 @@ from sl_nerfstudio.synthesis.devices import rays
 from sl_nerfstudio.synthesis.render import (
     FrameGeometry,
     RayCaster,
+    RenderedCapture,
     VisiblePoints,
     sample_view,
     shading_normals,
@@ -182,12 +183,9 @@ _MOTION_WIDTH = 600  # pixels, of the image in which a shot's motion is given
 
 
 @dataclass(frozen=True)
-class Photograph:
+class Photograph(RenderedCapture):
     """One frame: the truth at pixel centres, the image, and the file that the camera writes."""
 
-    coords: Float32[ndarray, "h w 2"]
-    mask: Bool[ndarray, "h w"]
-    object_mask: Bool[ndarray, "h w"]
     image: UInt8[ndarray, "h w 3"]  # as decoded from `jpeg`
     jpeg: bytes
 
@@ -208,7 +206,7 @@ def take_photograph(
     image = moved(image, shot.motion * stage.devices.camera.w / _MOTION_WIDTH, shot.motion_direction)
     sensor = Sensor(look.gain * shot.exposure, look.noise, look.gamma, shot.jpeg_quality)
     jpeg = sensor.encode(sensor.develop(image, rng))
-    return Photograph(view.coords, view.mask, view.object_mask, decode_jpeg(jpeg), jpeg)
+    return Photograph(**vars(view), image=decode_jpeg(jpeg), jpeg=jpeg)
 
 
 def _reflected(
@@ -301,9 +299,9 @@ def _small_lamps(stage: FrameGeometry, look: Look) -> SmallLamps:
     place = (np.arange(_LAMPS_ACROSS) + 0.5) / _LAMPS_ACROSS
     uv = np.stack(np.meshgrid(place * projector.w, place * projector.h), -1).reshape(-1, 2)
     direction = rays(projector, stage.T_world_projector, uv)
-    hits = stage.caster.first_hits(origin, direction)
-    hit = hits.face >= 0
-    p, face = hits.p_world[hit], hits.face[hit]
+    face, p = stage.caster.first_hits(origin, direction)
+    hit = face >= 0
+    p, face = p[hit], face[hit]
     distance = np.linalg.norm(p - origin, axis=-1)
     # light through a cell of the bundle: strength at a distance, times the cell's area there
     side = distance / projector.fl_x * projector.w / _LAMPS_ACROSS

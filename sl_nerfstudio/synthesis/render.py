@@ -7,10 +7,11 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int64
 from numpy import ndarray
+from scipy.ndimage import binary_dilation
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.pattern.grid import sample_bilinear
-from sl_nerfstudio.synthesis.appearance import Appearance
+from sl_nerfstudio.synthesis.appearance import Appearance, corner_fall_off
 from sl_nerfstudio.synthesis.devices import DevicePair, pixels, rays
 from sl_nerfstudio.synthesis.sdf import Scene
 
@@ -34,9 +35,10 @@ def make_surroundings(scene: Scene, background: Background, rng: np.random.Gener
         number = int(rng.integers(2, 4))
         azimuth = rng.uniform(0, 2 * np.pi) + (np.arange(number) + rng.uniform(-0.3, 0.3, number)) * 2 * np.pi / number
         parts += [_board(scene, float(a), rng) for a in azimuth]
-    corners = np.concatenate(parts)
-    faces = np.arange(len(corners) * 3).reshape(-1, 3)
-    return Scene("surroundings", corners.reshape(-1, 3), faces, _flat_normals(corners))
+    corners = np.concatenate(parts).reshape(-1, 3)
+    around = Scene("surroundings", corners, np.arange(len(corners)).reshape(-1, 3))
+    # the face's normal for each of its corners, so that shading keeps the edges sharp
+    return replace(around, vertex_normals=np.repeat(around.face_normals, 3, axis=0))
 
 
 def above_the_table(scene: Scene) -> Scene:
@@ -102,24 +104,9 @@ def _box(centre: Float[ndarray, "3"], half: Float[ndarray, "3"], turn: float) ->
     return centre + np.array(triangles) * half @ R.T
 
 
-def _flat_normals(corners: Float[ndarray, "f 3 3"]) -> Float[ndarray, "v 3"]:
-    """The face's normal for each of its corners, so that shading keeps the edges sharp."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-    return np.repeat(normal, 3, axis=0)
-
-
 # First hits of rays on a mesh: found by open3d in single precision, refined in double precision.
 
 _SAME_POINT = 2e-5  # of the distance: a hit this close to a point is the point
-
-
-@dataclass(frozen=True)
-class Hits:
-    """First hit of each ray; `face` is -1, and the point NaN, where there is none."""
-
-    face: Int64[ndarray, "n"]
-    p_world: Float64[ndarray, "n 3"]
 
 
 class RayCaster:
@@ -142,8 +129,10 @@ class RayCaster:
         """Whether faces belong to the object; false for surroundings, and where nothing is hit."""
         return (face >= 0) & (face < self._object_faces)
 
-    def first_hits(self, origin: Float[ndarray, "3"], direction: Float[ndarray, "n 3"]) -> Hits:
-        """Find the first hits of unit rays from one place.
+    def first_hits(
+        self, origin: Float[ndarray, "3"], direction: Float[ndarray, "n 3"]
+    ) -> tuple[Int64[ndarray, "n"], Float64[ndarray, "n 3"]]:
+        """Faces and points of the first hits of unit rays from one place; -1 and NaN where there is none.
 
         open3d finds the face; the point on its plane is computed in double precision.
         """
@@ -154,7 +143,7 @@ class RayCaster:
         corner = self.scene.vertices[self.scene.faces[face[hit], 0]]
         along = ((corner - origin) * normal).sum(-1) / (direction[hit] * normal).sum(-1)
         p_world[hit] = origin + along[:, None] * direction[hit]
-        return Hits(face, p_world)
+        return face, p_world
 
     def sees(
         self, origin: Float[ndarray, "3"], p_world: Float[ndarray, "n 3"], face: Int[ndarray, "n"]
@@ -196,6 +185,11 @@ class VisiblePoints:
     uv_projector: Float64[ndarray, "n 2"]
     lit: Bool[ndarray, "n"]  # hit, inside the pattern, and lit on the side that the camera sees
 
+    def coords(self, camera: Device) -> Float32[ndarray, "h w 2"]:
+        """Pattern pixels seen through all pixels of a camera, row by row; NaN where no light falls."""
+        lit = np.where(self.lit[:, None], self.uv_projector, np.nan)
+        return lit.astype(np.float32).reshape(camera.h, camera.w, 2)
+
 
 @dataclass(frozen=True)
 class RenderedCapture:
@@ -214,18 +208,18 @@ Light = Callable[[VisiblePoints, Int64[ndarray, "n"]], Float32[ndarray, "n *c"]]
 def visible_points(frame: FrameGeometry, uv: Float[ndarray, "n 2"]) -> VisiblePoints:
     """Cast rays through camera pixels `uv` onto the scene, and a shadow ray from the projector to every point found."""
     caster, eye, lamp = frame.caster, frame.T_world_camera[:3, 3], frame.T_world_projector[:3, 3]
-    hits = caster.first_hits(eye, rays(frame.devices.camera, frame.T_world_camera, uv))
-    hit = hits.face >= 0
+    all_faces, p_world = caster.first_hits(eye, rays(frame.devices.camera, frame.T_world_camera, uv))
+    hit = all_faces >= 0
     uv_projector = np.full(uv.shape, np.nan)
     lit = np.zeros(len(uv), dtype=bool)
-    p, face = hits.p_world[hit], hits.face[hit]
+    p, face = p_world[hit], all_faces[hit]
     uv_projector[hit], inside = pixels(frame.devices.projector, frame.T_world_projector, p)
     normal = caster.scene.face_normals[face]
     same_side = ((eye - p) * normal).sum(-1) * ((lamp - p) * normal).sum(-1) > 0
     reached = inside & same_side
     reached[reached] = caster.sees(lamp, p[reached], face[reached])
     lit[hit] = reached
-    return VisiblePoints(hit, hits.face, hits.p_world, uv_projector, lit)
+    return VisiblePoints(hit, all_faces, p_world, uv_projector, lit)
 
 
 def render_capture(
@@ -243,14 +237,7 @@ def render_capture(
 
 def visible_centres(frame: FrameGeometry) -> VisiblePoints:
     """Trace the rays through all pixel centres, row by row."""
-    camera = frame.devices.camera
-    n, box = camera.w * camera.h, np.flatnonzero(_box_of_the_scene(frame))
-    found = visible_points(frame, _corners(camera)[box] + 0.5)
-    hit, lit = np.zeros((2, n), dtype=bool)
-    face, p_world, uv_projector = np.full(n, -1), np.full((n, 3), np.nan), np.full((n, 2), np.nan)
-    hit[box], lit[box], face[box] = found.hit, found.lit, found.face
-    p_world[box], uv_projector[box] = found.p_world, found.uv_projector
-    return VisiblePoints(hit, face, p_world, uv_projector, lit)
+    return visible_points(frame, _corners(frame.devices.camera) + 0.5)
 
 
 def sample_view(
@@ -265,18 +252,17 @@ def sample_view(
     corner = _corners(frame.devices.camera)
     radiance = np.empty((h * w, *np.shape(nothing)), dtype=np.float32)
     radiance[:] = nothing
-    near = np.flatnonzero(_near_a_hit(centres.hit.reshape(h, w)))
+    # rays beside a pixel's centre may hit a surface that the one through it misses
+    near = np.flatnonzero(binary_dilation(centres.hit.reshape(h, w), np.ones((3, 3))))
     total = np.zeros((len(near), *np.shape(nothing)), dtype=np.float32)
     step = (np.arange(supersampling) + 0.5) / supersampling
     for dy in step:
         for dx in step:
             total += light(visible_points(frame, corner[near] + (dx, dy)), near)
     radiance[near] = total / supersampling**2
-    coords = np.full((h * w, 2), np.nan, dtype=np.float32)
-    coords[centres.lit] = centres.uv_projector[centres.lit]
     on_object = frame.caster.on_object(centres.face)
     return RenderedCapture(
-        coords.reshape(h, w, 2),
+        centres.coords(frame.devices.camera),
         centres.lit.reshape(h, w),
         on_object.reshape(h, w),
         radiance.reshape(h, w, *np.shape(nothing)),
@@ -286,26 +272,6 @@ def sample_view(
 def _corners(camera: Device) -> Int64[ndarray, "n 2"]:
     """Upper left corners (x, y) of all pixels, row by row."""
     return np.stack(np.meshgrid(np.arange(camera.w), np.arange(camera.h)), -1).reshape(-1, 2)
-
-
-def _box_of_the_scene(frame: FrameGeometry) -> Bool[ndarray, "h w"]:
-    """Pixels that may see a surface: a rectangle around its vertices, or all if some are behind the camera."""
-    camera, T_world_camera, vertices = frame.devices.camera, frame.T_world_camera, frame.caster.scene.vertices
-    uv, _ = pixels(camera, T_world_camera, vertices)
-    depth = -(vertices - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
-    box = np.zeros((camera.h, camera.w), dtype=bool)
-    if depth.min() <= 0 or camera.k1 or camera.k2 or camera.p1 or camera.p2:
-        return ~box  # behind the camera, or edges bent by distortion
-    (x0, y0), (x1, y1) = np.clip(np.floor(uv.min(0)) - 1, 0, None).astype(int), np.ceil(uv.max(0)).astype(int) + 1
-    box[y0:y1, x0:x1] = True
-    return box
-
-
-def _near_a_hit(hit: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Pixels with a ray that may hit a surface, even if the ray through their centre does not."""
-    padded = np.pad(hit, 1)
-    h, w = hit.shape
-    return np.logical_or.reduce([padded[i : i + h, j : j + w] for i in range(3) for j in range(3)])
 
 
 def _light(
@@ -321,7 +287,8 @@ def _light(
     to_projector = frame.T_world_projector[:3, 3] - p[lit]
     distance2 = (to_projector**2).sum(-1)
     cosine = np.abs((to_projector * normal[lit]).sum(-1)) / np.sqrt(distance2)
-    strength = appearance.projector_fall_off(uv, frame.devices.projector) * appearance.reference_distance**2 / distance2
+    fall_off = corner_fall_off(uv, frame.devices.projector, appearance.corner_loss)
+    strength = fall_off * appearance.reference_distance**2 / distance2
     light[lit] += (appearance.projected(sample_bilinear(pattern, uv)) * cosine * strength).astype(np.float32)
     out[seen.hit] = light * appearance.albedo(p)
     return out

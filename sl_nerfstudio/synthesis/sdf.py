@@ -55,6 +55,7 @@ Number = float | int
 Triple = tuple[Number, Number, Number]
 Field = Callable[[Float[ndarray, "n 3"]], Float[ndarray, "n"]]
 _NEWTON_STEPS = 2
+_COARSE = 4  # cells, between the points at which a field is sampled first
 _BLOCK = 50_000  # points evaluated together
 
 
@@ -147,15 +148,9 @@ def carve(blend: float, solid: Field, *tools: Field) -> Field:
     return field
 
 
-def mirrored(field: Field, axis: int = 0) -> Field:
-    """The field of the half where the coordinate is positive, on both sides."""
-
-    def both(p: Float[ndarray, "n 3"]) -> Float[ndarray, "n"]:
-        q = p.copy()
-        q[:, axis] = np.abs(q[:, axis])
-        return field(q)
-
-    return both
+def mirrored(field: Field) -> Field:
+    """The field of the half where x is positive, on both sides."""
+    return lambda p: field(np.column_stack([np.abs(p[:, 0]), p[:, 1:]]))
 
 
 def mesh_of(
@@ -172,7 +167,7 @@ def mesh_of(
     """
     # planes of the object must not be planes of the grid: exact zeros make marching cubes produce empty triangles
     low = np.asarray(lower, dtype=np.float64) - np.array([0.31, 0.37, 0.41]) * cell
-    count = np.ceil((np.asarray(upper) - low) / (4 * cell)).astype(int) * 4
+    count = np.ceil((np.asarray(upper) - low) / (_COARSE * cell)).astype(int) * _COARSE
     values = _sample_near_level(field, low, count, cell)
     rim = np.concatenate([values[[0, -1]].ravel(), values[:, [0, -1]].ravel(), values[:, :, [0, -1]].ravel()])
     if rim.min() <= 0:
@@ -196,10 +191,9 @@ def _smooth_min(a: Float[ndarray, "n"], b: Float[ndarray, "n"], blend: float) ->
     return np.minimum(a, b) - h * h * blend / 4
 
 
-def _sample_near_level(
-    field: Field, low: Float[ndarray, "3"], count: ndarray, cell: float, step: int = 4
-) -> Float[ndarray, "x y z"]:
+def _sample_near_level(field: Field, low: Float[ndarray, "3"], count: ndarray, cell: float) -> Float[ndarray, "x y z"]:
     """Values on a grid of count + 1 points; away from the level, only the sign of the nearest coarse point."""
+    step = _COARSE
     coarse = _on_grid(field, low, count // step + 1, step * cell)
     fine = np.sign(coarse)
     for axis in range(3):

@@ -38,14 +38,7 @@ from sl_nerfstudio.synthesis.devices import (
     make_paths,
     pose_sigma,
 )
-from sl_nerfstudio.synthesis.photograph import (
-    Photograph,
-    Shot,
-    choose_useless,
-    plan_shots,
-    take_photograph,
-    turn_away,
-)
+from sl_nerfstudio.synthesis.photograph import Photograph, Shot, choose_useless, plan_shots, take_photograph, turn_away
 from sl_nerfstudio.synthesis.render import (
     FrameGeometry,
     RayCaster,
@@ -130,7 +123,8 @@ def make_setup(config: SynthConfig) -> Setup:
     if config.background != "none":
         scene = above_the_table(scene)
     surroundings = make_surroundings(scene, config.background, random_stream(config.seed, Stream.SURROUNDINGS))
-    pattern, layout = _make_pattern(config)
+    default = GridPattern()
+    pattern, layout = (default.render(), default) if config.pattern is None else read_pattern(config.pattern)
     truth = make_paths(scene, config.frames, config.path, random_stream(config.seed, Stream.PATHS))
     devices = make_devices(scene, truth, (pattern.shape[1], pattern.shape[0]), config)
     photography = _make_photography(config, scene, pattern)
@@ -165,13 +159,6 @@ def make_cells(pattern: Float32[ndarray, "h w"], lattice: Lattice | None) -> Noi
         return NoisyCells(lattice.period, lattice.x0, lattice.y0, lattice.rows, lattice.columns, w, h)
     period = max(w, h) / 40
     return NoisyCells(period, period / 2, period / 2, max(1, round(h / period)), max(1, round(w / period)), w, h)
-
-
-def _make_pattern(config: SynthConfig) -> tuple[Float32[ndarray, "h w"], PatternLayout | None]:
-    if config.pattern is not None:
-        return read_pattern(config.pattern)
-    grid = GridPattern()
-    return grid.render(), grid
 
 
 def _make_photography(config: SynthConfig, scene: Scene, pattern: Float32[ndarray, "h w"]) -> Photography | None:
@@ -226,23 +213,13 @@ def synthesise(config: SynthConfig, output: Path) -> None:
     """
     config.check()
     if config.clean:
-        config = without_noise(config)
+        config = replace(
+            config, noise=0.0, missing=0.0, wrong=0.0, sensor_noise=0.0, pose_error=(0.0, 0.0),
+            autocalibration_error=(0.0, 0.0, 0.0),
+        )  # fmt: skip
     with NewFolder(output) as folder:  # before the slow work: nobody else may start it
         setup = make_setup(config)
         (_write_captures if config.images_only else _write_scan)(config, setup, folder)
-
-
-def without_noise(config: SynthConfig) -> SynthConfig:
-    """Make coordinates, images and poses exact."""
-    return replace(
-        config,
-        noise=0.0,
-        missing=0.0,
-        wrong=0.0,
-        sensor_noise=0.0,
-        pose_error=(0.0, 0.0),
-        autocalibration_error=(0.0, 0.0, 0.0),
-    )
 
 
 def world_from_scene(config: SynthConfig, scene: Scene) -> Similarity:
@@ -259,35 +236,28 @@ def world_from_scene(config: SynthConfig, scene: Scene) -> Similarity:
 
 def _frames(config: SynthConfig, setup: Setup) -> Iterator[SyntheticFrame]:
     """Rendered and disturbed frames, as many in memory as there are threads."""
-    together = max(threads(), 1)
+    together = threads()
     groups = [range(first, min(first + together, config.frames)) for first in range(0, config.frames, together)]
     rendered = chain.from_iterable(results([partial(_frame, config, setup, k) for k in group]) for group in groups)
     yield from track(rendered, "rendering", config.frames)
 
 
 def _frame(config: SynthConfig, setup: Setup, index: int) -> SyntheticFrame:
-    frame = _captured(config, setup, index)
-    noise = CoordinateNoise(config.noise, config.missing, config.wrong)
-    decoder = random_stream(config.seed, Stream.COORDS, index)
-    return replace(frame, coords=disturb_coords(frame.coords, frame.mask, setup.cells, noise, decoder))
-
-
-def _captured(config: SynthConfig, setup: Setup, index: int) -> SyntheticFrame:
-    """One frame with exact coordinates: a grey PNG of a plain scan, else a JPEG in colour."""
-    name = _frame_name(index)
+    """One frame: a grey PNG of a plain scan, else a JPEG in colour."""
     if setup.photography is not None:
-        photo = setup.photograph(index, config.supersampling, setup.photography, config.seed)
-        pattern = _pattern_image(as_grey(photo.image), photo.mask, setup)
-        return SyntheticFrame(
-            name, photo.image, photo.jpeg, ".jpg", pattern, photo.coords, photo.mask, photo.object_mask
-        )
-    rendered = setup.render(index, config.supersampling)
-    sensor = random_stream(config.seed, Stream.SENSOR, index)
-    image = disturb_image(rendered.radiance, GAIN, config.sensor_noise, sensor)
-    pattern = _pattern_image(image / 255, rendered.mask, setup)
-    return SyntheticFrame(
-        name, image, encode_png(image), ".png", pattern, rendered.coords, rendered.mask, rendered.object_mask
+        seen = setup.photograph(index, config.supersampling, setup.photography, config.seed)
+        image, encoded, suffix, grey = seen.image, seen.jpeg, ".jpg", as_grey(seen.image)
+    else:
+        seen = setup.render(index, config.supersampling)
+        sensor = random_stream(config.seed, Stream.SENSOR, index)
+        image = disturb_image(seen.radiance, GAIN, config.sensor_noise, sensor)
+        encoded, suffix, grey = encode_png(image), ".png", image / 255
+    noise = CoordinateNoise(config.noise, config.missing, config.wrong)
+    coords = disturb_coords(
+        seen.coords, seen.mask, setup.cells, noise, random_stream(config.seed, Stream.COORDS, index)
     )
+    pattern = _pattern_image(grey, seen.mask, setup)
+    return SyntheticFrame(_frame_name(index), image, encoded, suffix, pattern, coords, seen.mask, seen.object_mask)
 
 
 def _frame_name(index: int) -> str:
@@ -304,6 +274,10 @@ def _pattern_image(grey: Float[ndarray, "h w"], mask: Bool[ndarray, "h w"], setu
 
 def _to_8_bit(image: Float[ndarray, "h w"]) -> UInt8[ndarray, "h w"]:
     return np.rint(255 * image).astype(np.uint8)
+
+
+def _mask_image(mask: Bool[ndarray, "h w"]) -> bytes:
+    return encode_png(mask.astype(np.uint8) * np.uint8(255))
 
 
 def _scan_writer(config: SynthConfig, setup: Setup, root: Path, folder: NewFolder) -> ScanWriter:
@@ -358,14 +332,8 @@ def _add_files(writer: ScanWriter, config: SynthConfig, setup: Setup, truth: str
 def _captures_document(config: SynthConfig, setup: Setup) -> dict[str, Any]:
     """Document which frames are of use, and what the others lack."""
     shots = [None] * config.frames if setup.photography is None else setup.photography.shots
-    frames = [
-        {
-            "name": _frame_name(index),
-            "usable": shot is None or shot.fault is None,
-            "fault": None if shot is None else shot.fault,
-        }
-        for index, shot in enumerate(shots)
-    ]
+    faults = [None if shot is None else shot.fault for shot in shots]
+    frames = [{"name": _frame_name(k), "usable": fault is None, "fault": fault} for k, fault in enumerate(faults)]
     return {"appearance": config.appearance, "background": config.background, "frames": frames}
 
 
@@ -375,10 +343,7 @@ def _write_scan(config: SynthConfig, setup: Setup, folder: NewFolder) -> None:
         for index, frame in enumerate(_frames(config, setup)):
             start, truth = (_world_poses(config, setup, poses, index) for poses in (setup.start, setup.truth))
             _add(writer, frame, start, truth)
-            writer.add_file(
-                f"ground_truth/object_masks/{frame.name}.png",
-                encode_png(frame.object_mask.astype(np.uint8) * np.uint8(255)),
-            )
+            writer.add_file(f"ground_truth/object_masks/{frame.name}.png", _mask_image(frame.object_mask))
         _add_files(writer, config, setup, "ground_truth/")
 
 
@@ -388,9 +353,7 @@ def _write_captures(config: SynthConfig, setup: Setup, folder: NewFolder) -> Non
     with _scan_writer(exact, setup, folder.root / "ground_truth", folder) as truth:
         for index, frame in enumerate(_frames(exact, setup)):
             _add(truth, frame, _world_poses(exact, setup, setup.truth, index), None)
-            truth.add_file(
-                f"object_masks/{frame.name}.png", encode_png(frame.object_mask.astype(np.uint8) * np.uint8(255))
-            )
+            truth.add_file(f"object_masks/{frame.name}.png", _mask_image(frame.object_mask))
             folder.write(f"images/{frame.name}{frame.suffix}", frame.encoded)
         truth.add_file("captures.json", encode_json(_captures_document(config, setup)))
         _add_files(truth, exact, setup, "")

@@ -1,4 +1,4 @@
-"""The classical baseline must be a fair one."""
+"""The classical baselines must be fair ones."""
 
 from dataclasses import replace
 
@@ -7,10 +7,11 @@ import pytest
 
 from benchmarks.baselines.frame_to_model import fuse_frame_to_model
 from benchmarks.baselines.poses import register
-from benchmarks.baselines.tsdf import fuse
+from benchmarks.baselines.tsdf import backprojected, fuse, triangulated_depth
 from sl_nerfstudio.evaluation.evaluate import score_alignments
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.evaluation.reference import compare_poses, mesh_reference
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import Scan, read_ground_truth, read_scan
@@ -88,3 +89,30 @@ def test_frame_to_model_fusion_recovers_the_poses_of_frames_without_noise(
         assert before.min() > least and after.max() < most
     surface = read_mesh(root / "ground_truth/mesh.ply")
     assert np.percentile(IndexedMesh(surface).distance(mesh.vertices), 95) < 1.0
+
+
+# Depth maps.
+
+LENS = (-0.12, 0.05, 1e-3, -2e-3)
+
+
+@pytest.fixture(scope="module")
+def distorted(tmp_path_factory: pytest.TempPathFactory) -> Scan:
+    """Exact coordinates and poses, seen through a lens with distortion."""
+    root = tmp_path_factory.mktemp("distorted") / "scan"
+    synthesise(SynthConfig(frames=3, resolution=120, supersampling=1, clean=True, camera_distortion=LENS), root)
+    return read_scan(root)
+
+
+def test_depth_maps_are_those_of_an_ideal_pinhole(distorted: Scan) -> None:
+    """Nearest pixels are taken, so points are off by up to half a pixel's footprint across, and far less in depth."""
+    frame = distorted.frames[0]
+    assert frame.camera.k1 == LENS[0]
+    depth = triangulated_depth(frame, distorted, frame.T_world_camera, frame.T_world_projector)
+    assert depth.camera == Device(120, 120, frame.camera.fl_x, frame.camera.fl_y, frame.camera.cx, frame.camera.cy)
+    points = backprojected(depth)
+    p_world = points @ frame.T_world_camera[:3, :3].T + frame.T_world_camera[:3, 3]
+    surface = IndexedMesh(read_mesh(distorted.root / "ground_truth/mesh.ply"))
+    footprint = np.median(-points[:, 2]) / frame.camera.fl_x
+    assert np.percentile(surface.distance(p_world), 95) < footprint
+    assert (depth.depth > 0).sum() == pytest.approx(frame.read_mask().sum(), rel=0.1)

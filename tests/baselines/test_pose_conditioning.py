@@ -3,13 +3,7 @@
 import pytest
 import torch
 
-from benchmarks.pose_conditioning import (
-    AdamChoice,
-    Poses,
-    Problem,
-    adam,
-    gauss_newton,
-)
+from benchmarks.pose_conditioning import AdamChoice, Poses, Problem, adam, gauss_newton
 from sl_nerfstudio.dataparser.dataparser import load_scan
 from sl_nerfstudio.meshing.files import read_mesh
 from sl_nerfstudio.scan import read_ground_truth

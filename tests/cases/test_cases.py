@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from sl_nerfstudio.calibration.formats import read_device_file
 from sl_nerfstudio.cli import check, process
+from sl_nerfstudio.errors import UserError
 from tests.cli.snapshots import Ended, call
 
 REAL_DATA = Path(os.environ.get("SL_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
 FOLDER = Path(os.environ.get("SL_CASES", REAL_DATA.parent / "cases"))
-
-pytestmark = pytest.mark.slow
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,13 @@ class Case:
     main: Callable[[], None]
     words: tuple[str, ...]  # {case} and {out} stand for the case's folder and an empty one
     ends: Callable[[Ended], None]  # asserts what must be so
+
+
+def folder_of(name: str) -> Path:
+    folder = FOLDER / name
+    if not folder.exists():
+        pytest.skip(f"the files of this case were not found: {folder} (set SL_CASES to their folder)")
+    return folder
 
 
 def refused(*words: str) -> Callable[[Ended], None]:
@@ -62,10 +69,35 @@ CASES = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.name}-{case.words[1].split('/')[-1]}")
 def test_a_case(case: Case, tmp_path: Path) -> None:
-    folder = FOLDER / case.name
-    if not folder.exists():
-        pytest.skip(f"the files of this case were not found: {folder} (set SL_CASES to their folder)")
+    folder = folder_of(case.name)
     words = [word.format(case=folder, out=tmp_path) for word in case.words]
     case.ends(call(case.main, *words))
+
+
+# Intrinsics files that people have: what they hold is read, or the terms that cannot be are named.
+
+
+@pytest.fixture
+def lenses() -> Path:
+    return folder_of("opencv_14_terms")
+
+
+def test_fourteen_coefficients_of_which_nine_to_fourteen_are_zero(lenses):
+    camera, projector = (
+        read_device_file(lenses / "stereo14_zero.yml", role, (1136, 1046)) for role in ("camera", "projector")
+    )
+    assert (camera.fl_x, camera.cx) == (3173.5470908336333, 568.0544331842342 + 0.5)
+    assert (camera.k1, camera.k2, camera.p1) == (-0.18827534553754133, 2.7711625543207616, 0)
+    assert (projector.cx, projector.k1) == pytest.approx((567.17323067777738 + 0.5, -0.24851802551104779), abs=1e-6)
+
+
+@pytest.mark.parametrize(("role", "term"), [("camera", "k6 = -50.8"), ("projector", "k6 = -29.1")])
+def test_a_rational_model_that_a_scan_cannot_express_is_named(lenses, role, term):
+    with pytest.raises(
+        UserError, match=rf"stereo\.yml: {role}: the lens model has terms beyond .*\({term}\)"
+    ) as caught:
+        read_device_file(lenses / "stereo.yml", role, (1136, 1046))
+    assert "CALIB_RATIONAL_MODEL" in str(caught.value)

@@ -1,6 +1,7 @@
 """Small cases with ray-cast truth, made and separated once."""
 
 from collections.abc import Callable
+from functools import cache
 
 import pytest
 
@@ -11,27 +12,11 @@ from sl_nerfstudio.object_separation.separate import Separation, separate
 
 @pytest.fixture(scope="session")
 def cases() -> Callable[..., Case]:
-    """Ten frames of 110 x 110 pixels by object and background; other conditions on request."""
-    made: dict[tuple, Case] = {}
-
-    def get(name: str, background: str, zoom: float = 0.75) -> Case:
-        key = (name, background, zoom)
-        if key not in made:
-            made[key] = make_case(OBJECTS[name](), background, Conditions(10, 110, zoom))
-        return made[key]
-
-    return get
+    """Ten frames of 110 x 110 pixels by object and background; another zoom on request."""
+    return cache(lambda name, around, zoom=0.75: make_case(OBJECTS[name](), around, Conditions(10, 110, zoom)))
 
 
 @pytest.fixture(scope="session")
 def separated(cases: Callable[..., Case]) -> Callable[..., Separation]:
     """What is found in a case, which takes seconds; arguments as for `cases`."""
-    found: dict[tuple, Separation] = {}
-
-    def get(name: str, background: str, zoom: float = 0.75) -> Separation:
-        key = (name, background, zoom)
-        if key not in found:
-            found[key] = separate(cases(*key).frames)
-        return found[key]
-
-    return get
+    return cache(lambda *case: separate(cases(*case).frames))

@@ -212,10 +212,7 @@ def test_the_supporting_plane_is_found_where_it_is(separated, background, verdic
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "count", "reasons"),
-    [
-        ("box", 4, {"cameras on both sides", "surface behind it"}),
-        ("plaque", 1, {"edges seen", "surface behind it"}),
-    ],
+    [("box", 4, {"cameras on both sides", "surface behind it"}), ("plaque", 1, {"edges seen", "surface behind it"})],
 )
 def test_sides_of_an_object_are_part_of_it(separated, name, count, reasons):
     found = separated(name, "none").findings

@@ -1,11 +1,18 @@
 """The benchmarks for GPUs run to their end without one."""
 
+import ast
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 
 from benchmarks import gpu, launches
 from benchmarks.common.training import settings
+
+ROOT = Path(__file__).parents[2]
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # nerfstudio warns freely
 
@@ -50,3 +57,27 @@ def test_everything_about_a_gpu_can_be_tried_on_the_cpu(tiny_root, tmp_path, mon
     names = set(gpu.parts(gpu.Config(), tmp_path))  # on a GPU
     assert {"step paper triton graph", "step default torch", "surface default cuda", "surface default cpu"} <= names
     assert "surface paper 10000 steps" in names and "encoding paper nerfstudio torch" in names
+
+
+@pytest.mark.slow
+def test_all_kernels_compile_for_three_architectures_with_few_registers_and_hardly_a_spill(tiny_root, tmp_path):
+    output = tmp_path / "kernels.json"
+    command = [sys.executable, "-m", "benchmarks.kernels", "--scan", tiny_root, "--output", output]
+    environment = {k: v for k, v in os.environ.items() if k != "TRITON_INTERPRET"}
+    subprocess.run(command, cwd=ROOT, env=environment | {"TRITON_CACHE_DIR": str(tmp_path / "cache")}, check=True)
+    rows = json.loads(output.read_text())["rows"]
+    names = {row["kernel"] for row in rows}
+    for row in rows:
+        assert row["registers"] <= 128 and row["spills"] <= 16, row
+        added = row["kernel"] == "scatter" and row["architecture"] == 90
+        if added or row["kernel"] in ("encode", "to_points", "row_adam"):
+            assert row["vectors"] >= 8, row  # rows of eight features are read, and on sm_90 added, as two vectors
+    for architecture in (80, 89, 90):
+        assert {row["kernel"] for row in rows if row["architecture"] == architecture} == names
+    defined = {
+        node.name
+        for file in ("field/triton_backend.py", "rendering/triton_poses.py", "rendering/triton_kernels.py")
+        for node in ast.parse((ROOT / "sl_nerfstudio" / file).read_text()).body
+        if isinstance(node, ast.FunctionDef) and node.decorator_list and not node.name.startswith("_")
+    }
+    assert defined == names  # none is forgotten

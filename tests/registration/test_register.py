@@ -9,7 +9,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from benchmarks.registration.solids import ball, block, joined, meshed, without
+from benchmarks.registration.solids import ball, block, meshed
 from sl_nerfstudio.bundle_adjustment.registered_frames import (
     RegisteredFramesSettings,
     adjust_registered,
@@ -32,6 +32,7 @@ from sl_nerfstudio.registration.result import (
 from sl_nerfstudio.registration.surfaces import FrameCloud, frame_cloud
 from sl_nerfstudio.relative_pose.candidates import plane_starts
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of, ray_pairs
+from sl_nerfstudio.synthesis.sdf import carve, union
 from tests.bundle_adjustment.analytic import DISK_HEIGHT, PROJECTORS, camera_of, images_of, rig_of
 from tests.registration.analytic_clouds import clouds_of, errors_against, on_a_ball, part_of, pose_errors, rolled
 from tests.registration.shaped_clouds import RenderedClouds, rendered, write_bar
@@ -400,7 +401,7 @@ def test_a_frog_a_medal_that_slides_and_a_vase_that_is_round_have_no_sides(scene
 
 
 def test_solids_are_what_they_say():
-    solid = without(joined(block((0, 0, 0), (40, 30, 20), 0.01), ball((0, 0, 12), 9)), ball((20, 0, 0), 6))
+    solid = carve(0.0, union(0.0, block((0, 0, 0), (40, 30, 20), 0.01), ball((0, 0, 12), 9)), ball((20, 0, 0), 6))
     mesh = meshed(solid, (26, 22, 26), 0.5)
     assert mesh.is_watertight
     # a cap of 11 mm on a sphere of 9, less half a ball

@@ -1,9 +1,8 @@
-"""The parts of a photograph, each against a formula: textures, materials, light, lens, sensor, interreflection."""
+"""The parts of a photograph, each against a formula: textures, materials, light, lens, sensor."""
 
 import cv2
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.synthesis.appearance import (
@@ -20,9 +19,7 @@ from sl_nerfstudio.synthesis.appearance import (
     moved,
     tint,
 )
-from sl_nerfstudio.synthesis.photograph import Sensor, SmallLamps, decode_jpeg, interpolate_vectors, light_vectors
-from sl_nerfstudio.synthesis.render import RayCaster
-from sl_nerfstudio.synthesis.sdf import Scene
+from sl_nerfstudio.synthesis.photograph import Sensor, decode_jpeg
 
 
 @pytest.mark.parametrize("name", TEXTURES)
@@ -99,14 +96,15 @@ def test_room_light_comes_from_above_and_its_lamp_throws_shadows():
     np.testing.assert_allclose(light[:, 0], [0.3, 0.1, 0.05, 0.075], rtol=1e-6)
 
 
-def test_a_surface_of_one_depth_is_blurred_evenly():
-    image = np.random.default_rng(0).random((60, 50, 3)).astype(np.float32)
+def test_each_pixel_is_blurred_as_its_depth_demands():
+    """Left half in focus, right half behind: each side is that of the image blurred by its own sigma."""
+    image = np.random.default_rng(0).random((80, 120, 3)).astype(np.float32)
+    depth = np.full((80, 120), 500.0)
+    depth[:, 60:] = 450.0
     lens = Lens(0.6, 0.9, 500.0, 60.0, 3.5)
-    for depth in (500.0, 450.0):
-        sigma = float(lens.sigma(np.full((60, 50), depth))[0, 0])
-        assert sigma == pytest.approx(np.hypot(0.6, 0.9 * (500 / depth - 1) * 500 / 60), rel=1e-5)
-        expected = cv2.GaussianBlur(image, (0, 0), sigma)
-        np.testing.assert_allclose(lens.blurred(image, np.full((60, 50), depth)), expected, atol=2e-3)
+    out = lens.blurred(image, depth)
+    for part, sigma in ((np.s_[:, :60], 0.6), (np.s_[:, 60:], np.hypot(0.6, 0.9 * (500 / 450 - 1) * 500 / 60))):
+        np.testing.assert_allclose(out[part], cv2.GaussianBlur(image, (0, 0), sigma)[part], atol=2e-3)
     assert lens.sigma(np.full((1, 1), np.nan))[0, 0] == np.float32(3.5), "what is nowhere is far away"
 
 
@@ -138,67 +136,3 @@ def test_the_sensor_exposes_saturates_and_encodes():
     sensor = Sensor(1.0, 0.0, 1.0, 90)
     decoded = decode_jpeg(sensor.encode(smooth))
     assert decoded.shape == smooth.shape and np.abs(decoded.astype(int) - smooth).mean() < 3
-
-
-def _square(half, z, up=1):
-    corners = np.array([[-half, -half, z], [half, -half, z], [half, half, z], [-half, half, z]], dtype=float)
-    return corners, np.array([[0, 1, 2], [0, 2, 3]])[:, ::up]
-
-
-def _scene(*parts):
-    offset = np.cumsum([0, *(len(v) for v, _ in parts)])
-    faces = np.concatenate([f + o for (_, f), o in zip(parts, offset[:-1], strict=True)])
-    return Scene("test", np.concatenate([v for v, _ in parts]), faces)
-
-
-def _lit_disc(radius, n=60):
-    """A disc at z = 0 that shines upwards with radiosity 1, as small lamps."""
-    step = 2 * radius / n
-    x, y = np.meshgrid(*[(np.arange(n) + 0.5) * step - radius] * 2)
-    inside = np.hypot(x, y) < radius
-    p = np.stack([x[inside], y[inside], np.zeros(inside.sum())], 1)
-    return SmallLamps(p, np.tile([0.0, 0, 1], (len(p), 1)), np.full((len(p), 3), step**2), np.full(len(p), step))
-
-
-def test_bounced_light_of_a_disc_is_the_textbook_form_factor():
-    """Irradiance on the axis of a disc of radius r at height h under radiosity 1: r^2 / (r^2 + h^2)."""
-    caster = RayCaster(_scene(_square(50.0, 0.0), _square(50.0, 30.0, -1)))
-    eye = np.array([[0.0, 0.0, 30.0]])
-    down = np.array([[0.0, 0.0, -1.0]])
-    vectors = light_vectors(caster, _lit_disc(20.0, 36), eye, down)
-    assert vectors[0, 1] @ down[0] == pytest.approx(20**2 / (20**2 + 30**2), rel=0.01)
-    assert not light_vectors(caster, _lit_disc(20.0, 36), eye, -down).any(), "nothing reaches the side that looks away"
-
-
-def test_bounced_light_does_not_pass_through_surfaces():
-    between = _square(49.0, 15.0)
-    caster = RayCaster(_scene(_square(50.0, 0.0), _square(50.0, 30.0, -1), between))
-    eye, down = np.array([[0.0, 0.0, 30.0]]), np.array([[0.0, 0.0, -1.0]])
-    assert not light_vectors(caster, _lit_disc(20.0, 20), eye, down).any()
-
-
-def test_vectors_between_grid_places_are_interpolated_and_unknown_ones_left_out():
-    h, w, stride = 24, 36, 6
-    known = np.ones((4, 6), dtype=bool)
-    known[0, 0] = False
-    row, column = np.mgrid[:4, :6]
-    value = (3.0 * row + column)[known].astype(np.float32)
-    vectors = np.broadcast_to(value[:, None, None], (len(value), 3, 3)).copy()
-    full = interpolate_vectors(vectors, known, stride, (h, w))
-    assert full.shape == (h, w, 3, 3)
-    assert full[3 + 6 * 2, 3 + 6 * 3, 1, 2] == pytest.approx(3 * 2 + 3, rel=1e-3)
-    assert full[3 + 6 * 2 + 3, 3 + 6 * 3, 0, 0] == pytest.approx(3 * 2.5 + 3, rel=1e-3)
-    assert full[3, 3 + 3, 0, 0] == pytest.approx(1, rel=1e-2), "only the known neighbour counts"
-
-
-def test_a_blurred_image_has_the_blur_of_its_place():
-    """Left half in focus, right half far behind: each side is sharp or soft as its depth says."""
-    image = np.random.default_rng(0).random((80, 120, 3)).astype(np.float32)
-    depth = np.full((80, 120), 500.0)
-    depth[:, 60:] = 420.0
-    lens = Lens(0.5, 1.2, 500.0, 60.0, 3.5)
-    out = lens.blurred(image, depth)
-    soft = float(lens.sigma(depth)[0, -1])
-    for part, sigma in ((slice(10, 45), 0.5), (slice(75, 110), soft)):
-        expected = np.stack([gaussian_filter(image[..., k], sigma, truncate=4) for k in range(3)], -1)
-        assert np.corrcoef(out[10:70, part].ravel(), expected[10:70, part].ravel())[0, 1] > 0.995

@@ -1,4 +1,4 @@
-"""Random captures and graphs: the truth that comes with them is right; and what is fitted to their features."""
+"""Random captures, photographs and graphs: the truth that comes with them is right; the fit of right matches."""
 
 import numpy as np
 import pytest
