@@ -13,7 +13,6 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3, exp_so3
 from sl_nerfstudio.geometry.triangulation import pixel_rays, world_pixels
-from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.visibility import (
     ENOUGH,
@@ -32,7 +31,7 @@ from sl_nerfstudio.scan import Scan
 from tests.formulas import pixels
 
 from .ray_cast_scan import CAMERA, PROJECTOR, look_at, pairs_around, scan_of
-from .solids import plate, together, triangles_at_edges
+from .solids import ball, extracted, plate, together, triangles_at_edges
 
 POSES = (look_at((60.0, 0.0, 290.0)), look_at((-40.0, 30.0, 290.0)))
 
@@ -221,16 +220,6 @@ RADIUS = 40.0
 RING = pairs_around(6, elevation_deg=40)
 
 
-def ball(centre: tuple[float, float, float], radius: float, cell: float = 1.5) -> Mesh:
-    (x, y, z), r = centre, radius + 2 * cell
-    return extract_mesh(
-        lambda p: (p - p.new_tensor(centre)).norm(dim=-1) - radius,
-        round(2 * r / cell),
-        (x - r, y - r, z - r),
-        (x + r, y + r, z + r),
-    )
-
-
 def contains(mesh: Mesh, points: np.ndarray) -> np.ndarray:
     """Which points are vertices of the mesh."""
     known = {tuple(v) for v in mesh.vertices.round(9)}
@@ -291,11 +280,16 @@ def test_a_phantom_in_front_goes_and_what_it_hid_stays(truth, tmp_path):
     assert result.contradicted == pytest.approx((faces[0] & faces[1]).sum(), rel=0.1)
 
 
-def test_a_bulge_on_the_surface_goes(truth, ball_scan):
-    """Surface that is 8 mm too far out over a patch: every frame decodes something else there."""
-    towards = np.array([0.5, 0.0, np.sqrt(0.75)])
+def with_bulge(truth: Mesh, towards: np.ndarray, height: float, reach_deg: float) -> tuple[Mesh, np.ndarray]:
+    """The ball, too far out over a patch; and how many degrees each vertex is from the middle of the patch."""
     angle = np.degrees(np.arccos((truth.vertices / RADIUS @ towards).clip(-1, 1)))
-    bulged = Mesh(truth.vertices * (1 + 8 / RADIUS * np.clip((14 - angle) / 2, 0, 1))[:, None], truth.faces)
+    factor = 1 + height / RADIUS * np.clip((reach_deg - angle) / 2, 0, 1)
+    return Mesh(truth.vertices * factor[:, None], truth.faces), angle
+
+
+def test_a_bulge_on_the_surface_goes(truth, ball_scan):
+    """Every frame decodes something else there."""
+    bulged, angle = with_bulge(truth, np.array([0.5, 0.0, np.sqrt(0.75)]), 8.0, 14.0)
     result = trim_to_observed(bulged, ball_scan)
     kept = contains(result.mesh, bulged.vertices)
     assert not kept[angle < 10].any()
@@ -305,8 +299,7 @@ def test_a_bulge_on_the_surface_goes(truth, ball_scan):
 def test_one_frame_that_sees_through_an_invented_patch_outweighs_two_that_decode_nothing_there(truth, tmp_path):
     """A bulge over a patch that two of three frames do not decode, and one decodes where the object really is."""
     towards, poses = np.array([0.0, 0.0, 1.0]), RING[::2]
-    angle = np.degrees(np.arccos((truth.vertices / RADIUS @ towards).clip(-1, 1)))
-    bulged = Mesh(truth.vertices * (1 + 5 / RADIUS * np.clip((8 - angle) / 2, 0, 1))[:, None], truth.faces)
+    bulged, angle = with_bulge(truth, towards, 5.0, 8.0)
 
     def undecoded(number: int, coords: np.ndarray) -> np.ndarray:
         if number == 1:
@@ -321,10 +314,19 @@ def test_one_frame_that_sees_through_an_invented_patch_outweighs_two_that_decode
     assert kept[(angle > 15) & (angle < 40)].all()
 
 
-def cells(number: int, share: float, across: int = 16, size: int = 6) -> np.ndarray:
+def cells(number: int, share: float, size: int) -> np.ndarray:
     """A share of the cells of size x size camera pixels, another one in each frame."""
-    chosen = np.random.default_rng(number).random((across, across)) < share
-    return np.kron(chosen, np.ones((size, size), dtype=bool))
+    chosen = np.random.default_rng(number).random((192 // size, 192 // size)) < share
+    return np.kron(chosen, np.ones((size, size), dtype=bool))[..., None]
+
+
+def undecoded(share: float):
+    return lambda i, c: np.where(cells(i, share, 6), np.float32(np.nan), c)
+
+
+def wrong(i: int, c: np.ndarray) -> np.ndarray:
+    """3 % of the cells are off by 60 px."""
+    return c + np.float32(60) * cells(i, 0.03, 2)
 
 
 FINE = CAMERA.scaled(2.0)
@@ -338,35 +340,35 @@ def faces_observed(truth, tmp_path_factory) -> dict[int, int]:
     return {n: len(trim_to_observed(truth, scan).mesh.faces) for n, scan in scans.items()}
 
 
-@pytest.mark.parametrize("share", [0.15, 0.5])
-def test_undecoded_cells_inside_the_mask_make_no_hole(truth, faces_observed, tmp_path, share):
-    blank = np.float32(np.nan)
-    ball_scan = scan_of(
-        truth, RING, tmp_path / "scan", lambda i, c: np.where(cells(i, share, 32)[..., None], blank, c), FINE
-    )
-    holey = trim_to_observed(truth, ball_scan).mesh
-    assert euler(holey) == 1
-    assert len(holey.faces) == pytest.approx(faces_observed[len(RING)], rel=0.05)  # cells at the border are no gaps
-
-
-@pytest.mark.parametrize("frames", [1, 6])
-def test_wrongly_decoded_cells_make_no_hole(truth, faces_observed, tmp_path, frames):
-    """3 % wrong cells, off by 60 px; with one frame nothing else confirms the surface there."""
-    root, off = tmp_path / "scan", np.float32(60)
-    wrong = scan_of(truth, RING[:frames], root, lambda i, c: c + off * cells(i, 0.03, 96, 2)[..., None], FINE)
-    result = trim_to_observed(truth, wrong)
+@pytest.mark.parametrize(
+    ("frames", "change", "tolerance"),
+    [(6, undecoded(0.15), 0.05), (6, undecoded(0.5), 0.05), (6, wrong, 0.02), (1, wrong, 0.02)],
+    ids=["15 % undecoded", "half undecoded", "wrong", "wrong, and nothing else confirms the surface"],
+)
+def test_undecoded_and_wrong_cells_inside_the_mask_make_no_hole(
+    truth, faces_observed, tmp_path, frames, change, tolerance
+):
+    result = trim_to_observed(truth, scan_of(truth, RING[:frames], tmp_path / "scan", change, FINE))
     assert euler(result.mesh) == 1
-    assert len(result.mesh.faces) == pytest.approx(faces_observed[frames], rel=0.02)
+    assert len(result.mesh.faces) == pytest.approx(faces_observed[frames], rel=tolerance)  # cells at borders: no gaps
     assert frames > 1 or result.closed > 0
 
 
-def test_noise_of_coordinates_and_poses_cuts_nothing(truth, result, tmp_path):
+def test_noise_other_axes_and_missing_masks_cut_nothing(truth, ball_scan, result, tmp_path):
     rng = np.random.default_rng(0)
     noisy = scan_of(truth, RING, tmp_path / "scan", lambda i, c: c + rng.normal(0, 1, c.shape).astype(np.float32))
     tilt = exp_se3(torch.tensor([0.5, -0.5, 0.5, 0.003, 0.002, -0.003], dtype=torch.float64)).numpy()
-    moved = DevicePoses(noisy.poses.T_world_camera @ tilt, noisy.poses.T_world_projector)
-    faces = len(trim_to_observed(truth, noisy, moved).mesh.faces)
-    assert faces == pytest.approx(len(result.mesh.faces), rel=0.02)
+    tilted = DevicePoses(noisy.poses.T_world_camera @ tilt, noisy.poses.T_world_projector)
+    R = exp_so3(torch.tensor([0.3, -0.2, 0.9], dtype=torch.float64)).numpy()
+    S = Similarity(1.0, R, np.array([500.0, -20, 7]))
+    without = replace(ball_scan, frames=tuple(replace(f, mask_path=None) for f in ball_scan.frames))
+    for mesh, scan, poses, tolerance in (
+        (truth, noisy, tilted, 0.02),
+        (truth.mapped(S), ball_scan, ball_scan.poses.mapped(S), 2e-3),
+        (truth, without, None, 0),  # decoded pixels are the mask
+    ):
+        faces = len(trim_to_observed(mesh, scan, poses).mesh.faces)
+        assert faces == pytest.approx(len(result.mesh.faces), rel=tolerance)
 
 
 def test_shadows_and_hidden_parts_of_a_plane(tmp_path):
@@ -398,7 +400,7 @@ def box(bottom: float, top: float, half: float = 30.0) -> Mesh:
         q = (p - p.new_tensor(centre)).abs() - p.new_tensor(size)
         return q.clamp_min(0).norm(dim=-1) + q.max(-1).values.clamp_max(0)
 
-    return extract_mesh(sdf, 41, (-41.0, -41.0, -41.0), (41.0, 41.0, 41.0))
+    return extracted(sdf, 42, 41.0)
 
 
 def test_the_sides_of_a_thin_plate_do_not_grow_downwards(tmp_path):
@@ -444,26 +446,11 @@ def covered_pixels(T_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
     return out
 
 
-def test_given_poses_replace_those_of_the_scan(truth, ball_scan, result):
-    R = exp_so3(torch.tensor([0.3, -0.2, 0.9], dtype=torch.float64)).numpy()
-    S = Similarity(1.0, R, np.array([500.0, -20, 7]))
-    moved = trim_to_observed(truth.mapped(S), ball_scan, ball_scan.poses.mapped(S)).mesh
-    assert len(moved.faces) == pytest.approx(len(result.mesh.faces), rel=2e-3)
-
-
-def test_wrong_poses_say_so(truth, ball_scan):
+def test_wrong_poses_and_another_surface_are_told_apart(truth, ball_scan):
     upside_down, given = np.diag([1.0, -1.0, -1.0, 1.0]), ball_scan.poses
     poses = DevicePoses(given.T_world_camera @ upside_down, given.T_world_projector @ upside_down)
     said = r"the frames observed no part(.|\n)*no vertex that faces camera and projector is inside a mask"
     with pytest.raises(UserError, match=rf"{said}(.|\n)*last step(.|\n)*sl-process(.|\n)*--keep-unobserved"):
         trim_to_observed(truth, ball_scan, poses)
-
-
-def test_another_surface_says_so(ball_scan):
     with pytest.raises(UserError, match=r"coordinates are not the decoded ones; they differ by \d+ px"):
         trim_to_observed(ball((0.0, 0.0, -70.0), 25.0), ball_scan)
-
-
-def test_missing_mask_files_mean_decoded_pixels(truth, ball_scan, result):
-    without = replace(ball_scan, frames=tuple(replace(f, mask_path=None) for f in ball_scan.frames))
-    assert len(trim_to_observed(truth, without).mesh.faces) == len(result.mesh.faces)
