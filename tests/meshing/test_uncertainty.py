@@ -278,14 +278,6 @@ def test_vertices_move_as_surfaces_that_are_fitted_again(scan: Scan, views: list
         np.testing.assert_allclose(rows[:, : 12 * FRAMES] @ draw, found, rtol=1e-3, atol=1e-6)  # of about 0.03 mm
 
 
-def test_a_common_rigid_motion_is_no_uncertainty_of_the_shape(scan: Scan):
-    motion = np.r_[np.tile([1.0, 2.0, -1.0, 0.01, -0.02, 0.03], FRAMES), np.zeros(6 * FRAMES + 6)]
-    rigid = vertex_uncertainty(hill(), scan, scan.poses, JointCovariance(motion[:, None]), CELL)
-    exact = vertex_uncertainty(hill(), scan, scan.poses, None, CELL)
-    np.testing.assert_allclose(rigid.sigma, exact.sigma, rtol=1e-6)
-    assert np.array_equal(exact.sigma, exact.sigma_independent, equal_nan=True)
-
-
 def test_independent_part_is_the_noise_of_the_averaged_pixels(views: list[FrameViews], sums: VertexSums):
     mesh, seen = hill(), np.flatnonzero(sums.number)
     on_truth = replace(sums, pull=np.zeros_like(sums.pull), correlation=1.0)
