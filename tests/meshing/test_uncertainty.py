@@ -180,24 +180,15 @@ def rows_of(scan: Scan, views: list[FrameViews]) -> tuple[np.ndarray, np.ndarray
     return vertices, surface_rows(mesh.vertices[vertices], mesh.vertex_normals()[vertices], devices, confirmed)
 
 
-def test_sums_are_those_of_all_pairs_of_a_vertex_and_a_frame(views: list[FrameViews], sums: VertexSums):
-    vertex, slope, residual, pixels = (joined(views, n) for n in ("vertex", "slope", "residual", "pixels_per_area"))
-    noise, count = np.repeat([v.noise_px for v in views], [len(v.vertex) for v in views]), len(hill().vertices)
-    weight = pixels * (slope**2).sum(1)
-    wanted = {
-        "number": np.ones(len(weight)),
-        "distance": np.linalg.norm(residual, axis=1),
-        "weight": weight,
-        "variance": weight * noise**2,
-        "pull": pixels * (slope * residual).sum(1),
-    }
-    for name, values in wanted.items():
-        assert np.array_equal(getattr(sums, name), np.bincount(vertex, values, count)), name
-    for vertices in (np.arange(count), np.array([3, 900, 77])):
-        assert np.array_equal(sums.confirmed(vertices), confirmed_by(views, vertices))
-    angle = np.full(count, np.nan)
-    np.fmax.at(angle, vertex, joined(views, "ray_angle"))
-    assert np.array_equal(sums.ray_angle, angle, equal_nan=True)
+def test_frames_residuals_and_angles_are_those_that_confirm_a_vertex(scan: Scan, views: list[FrameViews]):
+    found, count = vertex_uncertainty(hill(), scan, scan.poses, None, CELL), len(hill().vertices)
+    vertex, angle = joined(views, "vertex"), np.full(count, np.nan)
+    number = np.bincount(vertex, minlength=count)
+    np.fmax.at(angle, vertex, np.degrees(joined(views, "ray_angle")))
+    length = np.bincount(vertex, np.linalg.norm(joined(views, "residual"), axis=1), count)
+    assert np.array_equal(found.views, number) and np.array_equal(found.sigma, found.sigma_independent, equal_nan=True)
+    np.testing.assert_allclose(found.residual[number > 0], (length / np.maximum(number, 1))[number > 0], rtol=1e-12)
+    np.testing.assert_allclose(found.ray_angle, angle, rtol=1e-12)
 
 
 def test_frames_that_confirm_too_little_have_the_noise_of_the_others():
