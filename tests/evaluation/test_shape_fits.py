@@ -11,7 +11,7 @@ from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.uncertainty import smoothing
 from tests.meshing.solids import mesh_of
 
-from .parts import scanned
+from .shapes import scanned
 
 HERE = Similarity.identity()
 CYLINDER = scanned(mesh_of(trimesh.creation.cylinder(15, 50, sections=200)), edge=1.5, noise=0.0, S=HERE)
