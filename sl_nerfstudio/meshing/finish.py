@@ -235,12 +235,7 @@ def _sizes(
     for k in np.flatnonzero(chosen).tolist():
         points = mesh.vertices[np.unique(faces[order[first[k] : first[k + 1]]])]
         if np.ptp(points, axis=0).max() <= largest:
-            size[k] = _diameter(points)
+            with suppress(QhullError):  # all of them lie in a plane: they are compared as they are
+                points = points[ConvexHull(points).vertices] if len(points) > _MANY else points
+            size[k] = pdist(points).max(initial=0.0)
     return size
-
-
-def _diameter(points: Float[ndarray, "n 3"]) -> float:
-    """The largest distance between two points; both are on the convex hull."""
-    with suppress(QhullError):  # all of them lie in a plane: they are compared as they are
-        points = points[ConvexHull(points).vertices] if len(points) > _MANY else points
-    return float(pdist(points).max(initial=0.0))
