@@ -14,7 +14,7 @@ from sl_nerfstudio.pattern.files import make_grid
 from sl_nerfstudio.scan import read_scan
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import synthesise
-from tests.evaluation.parts import ANYWHERE, bracket, scanned
+from tests.evaluation.shapes import ANYWHERE, bracket, scanned
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))

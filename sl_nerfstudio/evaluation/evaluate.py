@@ -218,19 +218,16 @@ def read_inputs(
 
 def read_refined_poses(path: Path, scan: Scan) -> DevicePoses:
     """Poses of a transforms.json made from `scan`. Raises UserError if they are those of another scan or unit."""
-    document = read_document(path)
+    document, problem = read_document(path), ""
     units, frames = document.get("units"), document.get("frames")
     if units != scan.units:
-        raise _of_another_scan(path, f"units: {units!r}, but the scan's are {scan.units!r}")
-    if isinstance(frames, list) and len(frames) != len(scan.frames):
-        raise _of_another_scan(path, f"holds {len(frames)} frames, the scan {len(scan.frames)}")
+        problem = f"units: {units!r}, but the scan's are {scan.units!r}"
+    elif isinstance(frames, list) and len(frames) != len(scan.frames):
+        problem = f"holds {len(frames)} frames, the scan {len(scan.frames)}"
+    if problem:
+        remedy = "give poses that were refined from this scan"
+        raise FileError(path, problem, "the poses are those of another scan", remedy)
     return read_poses(path, scan)
-
-
-def _of_another_scan(path: Path, problem: str) -> FileError:
-    return FileError(
-        path, problem, "the poses are those of another scan", "give poses that were refined from this scan"
-    )
 
 
 def read_reference(path: Path | None, scan: Scan, poses: DevicePoses, samples: int, seed: int) -> Reference | None:

@@ -12,7 +12,7 @@ from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.triangulation import world_pixels
 from sl_nerfstudio.late_imports import open3d as o3d
-from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.mesh import Mesh, ray_scene
 from sl_nerfstudio.parallel import compiled, results, split, threads
 from sl_nerfstudio.scan import Scan
 
@@ -118,10 +118,7 @@ class IndexedMesh:
         self.centre = (self.lower + self.upper) / 2
         self.diagonal = float(np.linalg.norm(self.upper - self.lower))
         self._scale = 1 / max(self.diagonal, 1e-300)
-        self._scene = o3d.t.geometry.RaycastingScene()
-        corners, faces = self._inside(self.vertices), self.faces.astype(np.uint32)
-        self._scene.add_triangles(o3d.core.Tensor(corners), o3d.core.Tensor(faces))
-        self._scene.cast_rays(o3d.core.Tensor(np.zeros((1, 6), np.float32)))  # the index, before threads share it
+        self._scene = ray_scene(self._inside(self.vertices), self.faces)
 
     def _inside(self, p: Float[ndarray, "n 3"]) -> Float[ndarray, "n 3"]:
         return ((p - self.centre) * self._scale).astype(np.float32)

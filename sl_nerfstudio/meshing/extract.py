@@ -1,6 +1,5 @@
 """The zero level of a signed distance field as a mesh, at a cost that grows with its area, not with the volume."""
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -116,27 +115,31 @@ def triangle_table() -> tuple[Int[ndarray, "256 t 3"], Int[ndarray, "256"]]:
 # Cells and corners have integer positions (x, y, z) from 0. A block is a cube of `size` cells, named by its lower cell.
 
 Field = Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]]
-"""Signed distance, negative inside, of points; both in the units of the box."""
+"""Signed distance, negative inside, of points in [-1, 1]^3."""
 
 LEAF = 2  # cells along an edge of the smallest blocks
 MAX_LEAVES = 30_000_000  # about 30 GB: if more are near the zero level, the field is not a surface
+SAFETY = 2.0  # times the bound of the slope: a field that is only roughly a distance is searched farther away
+_CHUNK = 1 << 18  # points that are evaluated at a time
+_COARSE = 32  # points along an axis, from which the slope is found
 
 
 @dataclass(frozen=True)
 class SparseGrid:
-    """A box cut into `cells` along x, y, z (each a multiple of LEAF), and how its field is evaluated."""
+    """The cube [-1, 1]^3 cut into `cells` along each axis (a multiple of LEAF), and how its field is evaluated."""
 
     field: Field
-    lower: tuple[float, float, float]
-    step: tuple[float, float, float]
-    cells: tuple[int, int, int]
+    cells: int
     device: torch.device
-    chunk: int = 1 << 18
+
+    @property
+    def step(self) -> float:
+        """Side of a cell."""
+        return 2.0 / self.cells
 
     def points(self, position: Num[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
         """Points, in float64, of positions counted in cells."""
-        lower = torch.tensor(self.lower, dtype=torch.float64, device=position.device)
-        return lower + position.double() * torch.tensor(self.step, dtype=torch.float64, device=position.device)
+        return position.double() * self.step - 1.0
 
     def values(self, position: Num[Tensor, "n 3"], stage: str) -> Float[Tensor, "n"]:
         """Field at positions counted in cells (whole or not), chunk by chunk.
@@ -145,8 +148,8 @@ class SparseGrid:
         """
         out = torch.empty(len(position), dtype=torch.float32, device=self.device)
         with torch.no_grad():
-            for start in track(range(0, len(position), self.chunk), f"surface: {stage}"):
-                part = self.points(position[start : start + self.chunk]).float()
+            for start in track(range(0, len(position), _CHUNK), f"surface: {stage}"):
+                part = self.points(position[start : start + _CHUNK]).float()
                 out[start : start + len(part)] = self.field(part).reshape(-1)
         if not bool(torch.isfinite(out).all()):
             raise UserError(
@@ -157,13 +160,13 @@ class SparseGrid:
 
     def corner_keys(self, corner: Int[Tensor, "*batch 3"]) -> Int[Tensor, "*batch"]:
         """Number the corners of the grid."""
-        nx, ny = self.cells[0] + 1, self.cells[1] + 1
-        return corner[..., 0] + nx * (corner[..., 1] + ny * corner[..., 2])
+        n = self.cells + 1
+        return corner[..., 0] + n * (corner[..., 1] + n * corner[..., 2])
 
     def corners(self, key: Int[Tensor, "n"]) -> Int[Tensor, "n 3"]:
         """Inverse of `corner_keys`."""
-        nx, ny = self.cells[0] + 1, self.cells[1] + 1
-        return torch.stack([key % nx, key // nx % ny, key // (nx * ny)], -1)
+        n = self.cells + 1
+        return torch.stack([key % n, key // n % n, key // (n * n)], -1)
 
 
 @dataclass(frozen=True)
@@ -183,35 +186,31 @@ def _offsets(n: int, device: torch.device) -> Int[Tensor, "n3 3"]:
     return torch.stack([x, y, z], -1).reshape(-1, 3)
 
 
-def slope_bound(grid: SparseGrid, samples: int = 32) -> float:
+def slope_bound(grid: SparseGrid) -> float:
     """Slope of the field between neighbours of a coarse lattice: its 99th percentile, at least 1.
 
     A distance has slope 1, a trained field almost. The bound scales the radius within which a block is kept.
     """
-    extent = torch.tensor(grid.cells, device=grid.device)
-    value = grid.values(_offsets(samples, grid.device) / (samples - 1) * extent, "slope").reshape((samples,) * 3)
-    spacing = [s * c / (samples - 1) for s, c in zip(grid.step, grid.cells, strict=True)]
-    slopes = torch.cat([value.diff(dim=2 - axis).abs().reshape(-1) / spacing[axis] for axis in range(3)])
+    value = grid.values(_offsets(_COARSE, grid.device) / (_COARSE - 1) * grid.cells, "slope").reshape((_COARSE,) * 3)
+    spacing = grid.step * grid.cells / (_COARSE - 1)
+    slopes = torch.cat([value.diff(dim=2 - axis).abs().reshape(-1) / spacing for axis in range(3)])
     return max(1.0, float(torch.quantile(slopes, 0.99)))
 
 
-def find_leaves(grid: SparseGrid, safety: float) -> Int[Tensor, "n 3"]:
+def find_leaves(grid: SparseGrid) -> Int[Tensor, "n 3"]:
     """Lower cells of all leaf blocks that may hold the zero level.
 
-    Starting from about 64 blocks along the longest side, a block is split into eight while the field at its centre is
-    smaller than `safety * slope_bound` times half the block's diagonal. Raises UserError if that is nearly everywhere.
+    Starting from about 64 blocks along each side, a block is split into eight while the field at its centre is smaller
+    than `SAFETY * slope_bound` times half the block's diagonal. Raises UserError if that is nearly everywhere.
     """
-    reach = safety * slope_bound(grid)
+    reach = SAFETY * slope_bound(grid)
     size = LEAF
-    while max(grid.cells) > 64 * size:
+    while grid.cells > 64 * size:
         size *= 2
-    extent = torch.tensor(grid.cells, device=grid.device)
-    counts = [-(-c // size) for c in grid.cells]
-    block = _offsets(max(counts), grid.device) * size
-    block = block[(block < extent).all(-1)]
+    block = _offsets(-(-grid.cells // size), grid.device) * size
     while True:
-        centre = torch.minimum(block + size / 2, extent)
-        half_diagonal = 0.5 * size * sum(s * s for s in grid.step) ** 0.5
+        centre = (block + size / 2).clamp_max(grid.cells)
+        half_diagonal = 0.5 * size * grid.step * 3**0.5
         block = block[grid.values(centre, f"blocks of {size} cells").abs() <= reach * half_diagonal]
         if size == LEAF:
             return block
@@ -222,7 +221,7 @@ def find_leaves(grid: SparseGrid, safety: float) -> Int[Tensor, "n 3"]:
             )
         size //= 2
         block = (block[:, None] + _offsets(2, grid.device) * size).reshape(-1, 3)
-        block = block[(block < extent).all(-1)]
+        block = block[(block < grid.cells).all(-1)]
 
 
 def evaluate_leaves(grid: SparseGrid, lower: Int[Tensor, "n 3"]) -> Leaves:
@@ -263,7 +262,6 @@ def _entered_neighbours(grid: SparseGrid, leaves: Leaves) -> Int[Tensor, "m 3"]:
     surface = inside.any(-1) & ~inside.all(-1)
     lower, inside = leaves.lower[surface], inside[surface]
     known = grid.corner_keys(leaves.lower).sort().values
-    extent = torch.tensor(grid.cells, device=grid.device)
     found = []
     for axis in range(3):
         for side, step in ((0, -LEAF), (LEAF, LEAF)):
@@ -271,52 +269,36 @@ def _entered_neighbours(grid: SparseGrid, leaves: Leaves) -> Int[Tensor, "m 3"]:
             shift = torch.zeros(3, dtype=torch.long, device=grid.device)
             shift[axis] = step
             neighbour = (lower + shift)[face.any(-1) & ~face.all(-1)]
-            neighbour = neighbour[((neighbour >= 0) & (neighbour < extent)).all(-1)]
+            neighbour = neighbour[((neighbour >= 0) & (neighbour < grid.cells)).all(-1)]
             found.append(neighbour[~_contains(known, grid.corner_keys(neighbour))])
     return grid.corners(torch.unique(grid.corner_keys(torch.cat(found))))
 
 
 _MARGIN = 1e-3  # of an edge: the smallest distance of a vertex from a corner, so that no triangle collapses
+POLISH = 1  # steps of regula falsi that move vertices from linear interpolation to the field's own zero
 
 
-def extract_mesh(
-    sdf: Field,
-    resolution: int,
-    lower: tuple[float, float, float] = (-1.0, -1.0, -1.0),
-    upper: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    device: torch.device | str = "cpu",
-    safety: float = 2.0,
-    polish: int = 1,
-) -> Mesh:
-    """Mesh of the zero level of `sdf` in the box, with `resolution` cells along its longest side.
+def extract_mesh(sdf: Field, resolution: int, device: torch.device | str = "cpu") -> Mesh:
+    """Mesh of the zero level of `sdf` in [-1, 1]^3, with `resolution` cells along each side.
 
-    `sdf` takes float32 points on `device`, at most 2^18 at a time, and gives the distance in the same units, negative
-    inside; an approximate distance is enough (with a larger `safety` the surface is searched farther away). The mesh
-    is in the box's frame, closed except where the surface leaves the box, and its normals point to positive values.
-    `polish` regula falsi steps move each vertex along its grid edge to the field's own zero, beyond linear
-    interpolation, for one more evaluation per vertex and step.
-    Raises UserError if there is no surface in the box, or the field is not a number.
+    `sdf` takes float32 points on `device`, at most 2^18 at a time, and gives their distance, negative inside; an
+    approximate one is enough. The mesh is closed except where the surface leaves the box, and its normals point to
+    positive values. Raises UserError if there is no surface in the box, or the field is not a number.
     """
     if resolution < 2:
         raise UserError(f"--resolution {resolution}: a mesh needs at least 2 cells along an axis; 256 or 512 is usual")
-    sides = [u - low for low, u in zip(lower, upper, strict=True)]
-    if min(sides) <= 0:
-        raise ValueError(f"the box is empty: lower {lower}, upper {upper}")
-    cell = max(sides) / resolution
-    nx, ny, nz = (LEAF * math.ceil(side / cell / LEAF - 1e-9) for side in sides)
-    step = (sides[0] / nx, sides[1] / ny, sides[2] / nz)
-    grid = SparseGrid(sdf, lower, step, (nx, ny, nz), torch.device(device))
-    leaves = evaluate_leaves(grid, find_leaves(grid, safety))
+    grid = SparseGrid(sdf, LEAF * -(-resolution // LEAF), torch.device(device))
+    leaves = evaluate_leaves(grid, find_leaves(grid))
     corner, case = _surface_cells(leaves)
     if len(case) == 0:
         raise UserError(_no_surface(grid))
     edges, faces = _triangles(corner, case)
-    vertices = _vertices(grid, leaves, edges, polish)
+    vertices = _vertices(grid, leaves, edges)
     return Mesh(vertices.cpu().numpy(), faces.cpu().numpy())
 
 
 def _no_surface(grid: SparseGrid) -> str:
-    centre = torch.tensor([[c / 2 for c in grid.cells]], device=grid.device)
+    centre = torch.full((1, 3), grid.cells / 2, device=grid.device)
     sign = "positive" if float(grid.values(centre, "centre")[0]) > 0 else "negative"
     return (
         f"the field has no zero level in the box: it is {sign} everywhere, so there is no surface to export. "
@@ -356,14 +338,14 @@ def _triangles(corner: Int[Tensor, "m 8"], case: Int[Tensor, "m"]) -> tuple[Int[
     return torch.stack([key // 3, high], -1), faces
 
 
-def _vertices(grid: SparseGrid, leaves: Leaves, edges: Int[Tensor, "v 2"], polish: int) -> Float[Tensor, "v 3"]:
+def _vertices(grid: SparseGrid, leaves: Leaves, edges: Int[Tensor, "v 2"]) -> Float[Tensor, "v 3"]:
     """Zeros of the field along the cut edges, in the box's frame, float64."""
     start, end = (grid.corners(leaves.key[edges[:, i]]).double() for i in range(2))
     direction = end - start
     a, b = torch.zeros_like(start[:, 0]), torch.ones_like(start[:, 0])
     value_a, value_b = (leaves.value[edges[:, i]].double() for i in range(2))
     t = _zero(a, b, value_a, value_b)
-    for _ in range(polish):
+    for _ in range(POLISH):
         value = grid.values(start + t[:, None] * direction, "polish").double()
         below = (value < 0) == (value_a < 0)
         a, value_a = torch.where(below, t, a), torch.where(below, value, value_a)

@@ -15,7 +15,7 @@ from scipy.spatial.distance import pdist
 from torch import Tensor
 
 from sl_nerfstudio.meshing.extract import Field
-from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.mesh import Mesh, ray_scene
 from sl_nerfstudio.meshing.visibility import Trimmed
 
 # A mesh whose vertices say whether they were observed.
@@ -60,20 +60,16 @@ class ClosestSurface:
 
     def __init__(self, mesh: Mesh) -> None:
         """`mesh` may be open."""
-        from sl_nerfstudio.late_imports import open3d as o3d
-
-        self._o3d = o3d
         self._centre = mesh.vertices.mean(0)
         self._scale = max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
-        self._scene = o3d.t.geometry.RaycastingScene()
-        self._scene.add_triangles(self._scaled(mesh.vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-
-    def _scaled(self, points: Float64[ndarray, "n 3"]) -> object:
-        return self._o3d.core.Tensor(((points - self._centre) / self._scale).astype(np.float32))
+        self._scene = ray_scene((mesh.vertices - self._centre) / self._scale, mesh.faces)
 
     def closest(self, points: Float64[ndarray, "n 3"]) -> ClosestPoints:
         """Find the closest point of the mesh to every point."""
-        found = self._scene.compute_closest_points(self._scaled(points))
+        from sl_nerfstudio.late_imports import open3d as o3d
+
+        scaled = ((points - self._centre) / self._scale).astype(np.float32)
+        found = self._scene.compute_closest_points(o3d.core.Tensor(scaled))
         u, v = found["primitive_uvs"].numpy().T.astype(np.float64)
         there = found["points"].numpy() * self._scale + self._centre
         distance = np.linalg.norm(points - there, axis=1).astype(np.float64)
@@ -89,24 +85,21 @@ Planes = list[tuple[Float64[ndarray, "3"], float]]
 """Unit normals n and offsets d: points with n . p > d are above."""
 
 
-class ClosedField:
-    """The solid of a field within the box [-1, 1]^3 and above planes.
+def closed_field(field: Field, planes: Planes, device: torch.device) -> Field:
+    """The solid of a field within the box [-1, 1]^3 and above planes, which are in the box's frame.
 
     A point is inside if it is inside the field's surface, inside the box, and above every plane: the largest of these
     signed distances, so walls and planes cut the solid with flat faces.
     """
+    normals = [(torch.as_tensor(n, dtype=torch.float32, device=device), d) for n, d in planes]
 
-    def __init__(self, field: Field, planes: Planes, device: torch.device) -> None:
-        """`planes` are in the box's frame."""
-        self._field = field
-        self._normals = [(torch.as_tensor(n, dtype=torch.float32, device=device), d) for n, d in planes]
-
-    def __call__(self, p: Tensor) -> Tensor:
-        """Signed distance of points (n, 3), at least approximately; negative inside."""
-        found = torch.maximum(self._field(p), p.abs().amax(-1) - (1 - _MARGIN))
-        for normal, offset in self._normals:
+    def solid(p: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        found = torch.maximum(field(p), p.abs().amax(-1) - (1 - _MARGIN))
+        for normal, offset in normals:
             found = torch.maximum(found, offset - p @ normal)
         return found
+
+    return solid
 
 
 def hull_planes(points: Float[ndarray, "n 3"], margin: float) -> Planes:
@@ -242,12 +235,7 @@ def _sizes(
     for k in np.flatnonzero(chosen).tolist():
         points = mesh.vertices[np.unique(faces[order[first[k] : first[k + 1]]])]
         if np.ptp(points, axis=0).max() <= largest:
-            size[k] = _diameter(points)
+            with suppress(QhullError):  # all of them lie in a plane: they are compared as they are
+                points = points[ConvexHull(points).vertices] if len(points) > _MANY else points
+            size[k] = pdist(points).max(initial=0.0)
     return size
-
-
-def _diameter(points: Float[ndarray, "n 3"]) -> float:
-    """The largest distance between two points; both are on the convex hull."""
-    with suppress(QhullError):  # all of them lie in a plane: they are compared as they are
-        points = points[ConvexHull(points).vertices] if len(points) > _MANY else points
-    return float(pdist(points).max(initial=0.0))

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int, Int64, UInt8
@@ -86,6 +87,16 @@ class Mesh:
         """Median length of an edge: the resolution of the mesh."""
         a, b = self.vertices[self.faces[:, 0]], self.vertices[self.faces[:, 1]]
         return float(np.median(np.linalg.norm(a - b, axis=1))) if len(self.faces) else 0.0
+
+
+def ray_scene(vertices: Float[ndarray, "v 3"], faces: Int[ndarray, "f 3"]) -> Any:
+    """open3d's search tree over triangles, in single precision: lengths should be about 1. Threads may share it."""
+    from sl_nerfstudio.late_imports import open3d as o3d
+
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(vertices.astype(np.float32)), o3d.core.Tensor(faces.astype(np.uint32)))
+    scene.cast_rays(o3d.core.Tensor(np.zeros((1, 6), np.float32)))  # makes the tree
+    return scene
 
 
 # What is known about each vertex of a mesh.

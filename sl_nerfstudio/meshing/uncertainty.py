@@ -1,6 +1,6 @@
 """Uncertainty of every vertex of a surface, and of distances on it, by linear propagation."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -42,20 +42,6 @@ class FrameDevices:
     T_camera_projector: Float[Tensor, "4 4"]
 
 
-@dataclass(frozen=True)
-class SurfaceView:
-    """Points of a surface as one frame sees them."""
-
-    p_camera: Float[Tensor, "n 3"]
-    uv_camera: Float[Tensor, "n 2"]
-    uv_projector: Float[Tensor, "n 2"]  # predicted
-    by_point: Float[Tensor, "n 2 3"]  # of the predicted coordinate by the point in the camera's axes
-    slope: Float[Tensor, "n 2"]  # of the residual, projector pixels per unit of length along the normal
-    by_pixel: Float[Tensor, "n 2 2"]  # of the predicted coordinate by the camera pixel, along the surface
-    pixels_per_area: Float[Tensor, "n"]  # camera pixels on a unit of the surface's area
-    ray_angle: Float[Tensor, "n"]  # between camera ray and projector ray, radian
-
-
 def packed_devices(d: FrameDevices) -> Float[ndarray, "devices"]:
     """The devices of a frame as compiled loops read them."""
     T_camera_world, T_projector_camera = inverse(d.T_world_camera), inverse(d.T_camera_projector)
@@ -66,21 +52,11 @@ def packed_devices(d: FrameDevices) -> Float[ndarray, "devices"]:
     )
 
 
-def view_surface(d: FrameDevices, p_world: Float[Tensor, "n 3"], normal: Float[Tensor, "n 3"]) -> SurfaceView:
-    """The view of points with unit normals, which must be in front of both devices and face the camera."""
+def view_surface(d: FrameDevices, p_world: Float[ndarray, "n 3"], normal: Float[ndarray, "n 3"]) -> np.recarray:
+    """Rows of `SURFACE_VIEW` for points with unit normals, which must be before both devices and face the camera."""
     rows = np.empty((len(p_world), loops.VIEW))
-    _view_points(len(rows), packed_devices(d), p_world.numpy(), normal.numpy(), rows)
-    views = torch.from_numpy(rows)
-    return SurfaceView(
-        p_camera=views[:, loops.P_CAMERA : loops.BY_POINT],
-        by_point=views[:, loops.BY_POINT : loops.UV_CAMERA].unflatten(1, (2, 3)),
-        uv_camera=views[:, loops.UV_CAMERA : loops.UV_PROJECTOR],
-        uv_projector=views[:, loops.UV_PROJECTOR : loops.SLOPE],
-        slope=views[:, loops.SLOPE : loops.BY_PIXEL],
-        by_pixel=views[:, loops.BY_PIXEL : loops.AREA].unflatten(1, (2, 2)),
-        pixels_per_area=views[:, loops.AREA],
-        ray_angle=views[:, loops.ANGLE],
-    )
+    _view_points(len(rows), packed_devices(d), p_world, normal, rows)
+    return rows.view(loops.SURFACE_VIEW)[:, 0].view(np.recarray)
 
 
 @compiled_range
@@ -151,7 +127,7 @@ def views_by_frame(
     def views(k: int) -> FrameViews:
         frame, T = scan.frames[k], (poses.T_world_camera[k], poses.T_world_projector[k])
         seen, _ = lit_vertices(points, normals, chosen, occluder, frame.camera, scan.projector, *T)
-        view = view_surface(devices_of(scan, poses, k), torch.from_numpy(points[seen]), torch.from_numpy(normals[seen]))
+        view = view_surface(devices_of(scan, poses, k), points[seen], normals[seen])
         return _confirmed(seen, view, frame.read_coords())
 
     numbers = range(len(scan.frames))
@@ -159,21 +135,19 @@ def views_by_frame(
         yield from results([partial(views, k) for k in numbers[first : first + threads()]])
 
 
-def _confirmed(seen: Int64[ndarray, "n"], view: SurfaceView, coords: Float[ndarray, "h w 2"]) -> FrameViews:
+def _confirmed(seen: Int64[ndarray, "n"], view: np.recarray, coords: Float[ndarray, "h w 2"]) -> FrameViews:
     """The vertices, of those that a frame sees, whose predictions its decoded coordinates confirm."""
-    uv = view.uv_camera.numpy()
-    column, row = np.floor(uv).astype(np.int64).T
-    at_pixel = np.einsum("nij,nj->ni", view.by_pixel.numpy(), np.stack([column, row], 1) + 0.5 - uv)
-    residual = view.uv_projector.numpy() + at_pixel - coords[row, column]
+    column, row = np.floor(view.uv_camera).astype(np.int64).T
+    at_pixel = np.einsum("nij,nj->ni", view.by_pixel, np.stack([column, row], 1) + 0.5 - view.uv_camera)
+    residual = view.uv_projector + at_pixel - coords[row, column]
     size = np.linalg.norm(residual, axis=1)
     known = np.isfinite(size)
     usual = float(np.median(size[known])) if known.any() else 0.0
     good = np.flatnonzero(known & (size <= np.clip(MEDIANS * usual, LEAST_PX, MOST_PX)))
-    residual = residual[good]
-    slope, pixels_per_area, ray_angle = (x.numpy()[good] for x in (view.slope, view.pixels_per_area, view.ray_angle))
-    noise = _spread(_across(slope, residual))
-    ratio = _window_ratio(coords, view, good, noise)
-    return FrameViews(seen[good], slope, residual, pixels_per_area, ray_angle, noise, ratio)
+    view, residual = view[good], residual[good]
+    noise = _spread(_across(view.slope, residual))
+    ratio = _window_ratio(coords, view, noise)
+    return FrameViews(seen[good], view.slope, residual, view.pixels_per_area, view.ray_angle, noise, ratio)
 
 
 def _across(slope: Float[ndarray, "m 2"], residual: Float[ndarray, "m 2"]) -> Float[ndarray, "m"]:
@@ -185,12 +159,13 @@ def _spread(values: Float[ndarray, "n"]) -> float:
     return float(np.median(np.abs(values))) * MAD_TO_SIGMA if len(values) >= _FEWEST else float("nan")
 
 
-def _window_ratio(coords: Float[ndarray, "h w 2"], view: SurfaceView, good: Int64[ndarray, "m"], noise: float) -> float:
-    """Variance of look-ups, which average a window, over that of single pixels; of the points that are good."""
-    some = good[evenly_spaced(len(good), min(_LOOKED_UP, len(good)))]
+def _window_ratio(coords: Float[ndarray, "h w 2"], view: np.recarray, noise: float) -> float:
+    """Variance of look-ups, which average a window, over that of single pixels."""
+    some = view[evenly_spaced(len(view), min(_LOOKED_UP, len(view)))]
     maps = CoordinateMaps.of([torch.from_numpy(coords)])
-    seen = maps.look_up(torch.zeros(len(some), dtype=torch.int64), view.uv_camera[some])
-    across = _across(view.slope.numpy()[some], (view.uv_projector[some] - seen.uv_projector).numpy())
+    uv_camera = torch.from_numpy(np.ascontiguousarray(some.uv_camera))
+    seen = maps.look_up(torch.zeros(len(some), dtype=torch.int64), uv_camera)
+    across = _across(some.slope, some.uv_projector - seen.uv_projector.numpy())
     return (_spread(across[seen.valid.numpy()]) / noise) ** 2 if noise > 0 else float("nan")
 
 
@@ -275,32 +250,32 @@ def independent_variance(mesh: Mesh, sums: VertexSums, averaged_area: float) -> 
         return np.full(len(total), np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
         from_noise = sums.correlation * sums.variance / averaged_area / total**2
-        smooth = Smoothing(mesh, averaged_area)
+        smooth = smoothing(mesh, averaged_area)
         misfit = smooth(sums.pull) / smooth(total)
         from_misfit = smooth(np.where(seen, misfit**2, 0.0)) / smooth(seen.astype(float))
     return np.where(seen, np.fmax(from_noise, from_misfit), np.nan)
 
 
-class Smoothing:
-    """Averages values of vertices over an area of the mesh, by diffusion along its edges."""
+def smoothing(mesh: Mesh, area: float) -> Callable[[Float[ndarray, "v"]], Float[ndarray, "v"]]:
+    """A function that averages values of vertices over an area of the mesh, by diffusion; their sum stays.
 
-    def __init__(self, mesh: Mesh, area: float) -> None:
-        """A Gaussian of standard deviation d averages as much as a disk of area 4 pi d^2."""
-        count = len(mesh.vertices)
-        a, b = mesh.edges().T
-        ends = np.concatenate([a, b]), np.concatenate([b, a])
-        links = coo_array((np.ones(2 * len(a)), ends), (count, count)).tocsr()
-        degree = np.maximum(np.asarray(links.sum(1)).reshape(-1), 1.0)
-        self._links, self._degree = links, degree
-        # A round keeps half of each value and spreads the other half: d^2 grows by a quarter of the squared edge.
-        edge2 = float(((mesh.vertices[a] - mesh.vertices[b]) ** 2).sum(1).mean())
-        self._rounds = min(round(area / (4 * np.pi) / (edge2 / 4)), _MOST_ROUNDS) if edge2 > 0 else 0
+    A Gaussian of standard deviation d averages as much as a disk of area 4 pi d^2.
+    """
+    count = len(mesh.vertices)
+    a, b = mesh.edges().T
+    ends = np.concatenate([a, b]), np.concatenate([b, a])
+    links = coo_array((np.ones(2 * len(a)), ends), (count, count)).tocsr()
+    degree = np.maximum(np.asarray(links.sum(1)).reshape(-1), 1.0)
+    # A round keeps half of each value and spreads the other half: d^2 grows by a quarter of the squared edge.
+    edge2 = float(((mesh.vertices[a] - mesh.vertices[b]) ** 2).sum(1).mean())
+    rounds = min(round(area / (4 * np.pi) / (edge2 / 4)), _MOST_ROUNDS) if edge2 > 0 else 0
 
-    def __call__(self, values: Float[ndarray, "v"]) -> Float[ndarray, "v"]:
-        """The averages; the sum over all vertices stays."""
-        for _ in range(self._rounds):
-            values = 0.5 * values + 0.5 * (self._links @ (values / self._degree))
+    def smooth(values: Float[ndarray, "v"]) -> Float[ndarray, "v"]:
+        for _ in range(rounds):
+            values = 0.5 * values + 0.5 * (links @ (values / degree))
         return values
+
+    return smooth
 
 
 # Uncertainty of every vertex along its normal, by linear propagation.

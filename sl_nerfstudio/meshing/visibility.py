@@ -14,7 +14,7 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import MODELS, Device, Intrinsics, ray_of, view_of
 from sl_nerfstudio.geometry.lie import DevicePoses
 from sl_nerfstudio.geometry.numerics import component_labels
-from sl_nerfstudio.meshing.mesh import Mesh
+from sl_nerfstudio.meshing.mesh import Mesh, ray_scene
 from sl_nerfstudio.parallel import compiled, compiled_range
 from sl_nerfstudio.scan.types import Frame, Scan
 
@@ -25,7 +25,17 @@ from sl_nerfstudio.scan.types import Frame, Scan
 # A frame's devices as one row: world to camera and camera to projector (rows of 3 x 4 matrices), the projector's centre
 # in camera axes, the parameters and the codes of both models.
 CAMERA_POSE, PROJECTOR_POSE, CENTRE, CAMERA, PROJECTOR, CODES, DEVICES = 0, 12, 24, 27, 35, 43, 45
-# What is known of one point, as one row.
+SURFACE_VIEW = np.dtype([
+    ("p_camera", "f8", 3),
+    ("by_point", "f8", (2, 3)),  # of the predicted coordinate by the point in the camera's axes
+    ("uv_camera", "f8", 2),
+    ("uv_projector", "f8", 2),  # predicted
+    ("slope", "f8", 2),  # of the residual, projector pixels per unit of length along the normal
+    ("by_pixel", "f8", (2, 2)),  # of the predicted coordinate by the camera pixel, along the surface
+    ("pixels_per_area", "f8"),  # camera pixels on a unit of the surface's area
+    ("ray_angle", "f8"),  # between camera ray and projector ray, radian
+])  # fmt: skip
+"""What is known of one point, as one row; and where its parts begin, for compiled loops."""
 P_CAMERA, BY_POINT, UV_CAMERA, UV_PROJECTOR, SLOPE, BY_PIXEL, AREA, ANGLE, VIEW = 0, 3, 9, 11, 13, 15, 19, 20, 21
 
 
@@ -237,16 +247,10 @@ class Occluder:
 
     def __init__(self, mesh: Mesh) -> None:
         """`mesh` may be open; both of its sides hide what is behind them."""
-        from sl_nerfstudio.late_imports import open3d as o3d
-
-        self._o3d = o3d
         self._centre = mesh.vertices.mean(0)
         self._scale = 1 / max(float(np.ptp(mesh.vertices, axis=0).max()), 1e-300)
         self._start = 2 * mesh.edge_length()
-        self._scene = o3d.t.geometry.RaycastingScene()
-        vertices = ((mesh.vertices - self._centre) * self._scale).astype(np.float32)
-        self._scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(mesh.faces.astype(np.uint32)))
-        self._scene.cast_rays(o3d.core.Tensor(np.zeros((1, 6), np.float32)))  # the index, before threads share it
+        self._scene = ray_scene((mesh.vertices - self._centre) * self._scale, mesh.faces)
 
     def hidden(
         self,
@@ -260,9 +264,11 @@ class Occluder:
         Rays start two edge lengths away from the surface, along the normal and towards the eye, so that they do not hit
         the triangles they start from.
         """
+        from sl_nerfstudio.late_imports import open3d as o3d
+
         rays = np.empty((len(chosen), 6), np.float32)
         _write_rays(len(chosen), points, normals, chosen, eye, self._start, self._centre, self._scale, rays)
-        return self._scene.test_occlusions(self._o3d.core.Tensor(rays), tnear=0.0, tfar=1.0).numpy()
+        return self._scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=1.0).numpy()
 
 
 def lit_vertices(

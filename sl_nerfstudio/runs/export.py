@@ -21,14 +21,14 @@ from sl_nerfstudio.console import phase, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
-from sl_nerfstudio.meshing.extract import extract_mesh
+from sl_nerfstudio.meshing.extract import Field, extract_mesh
 from sl_nerfstudio.meshing.files import observed_points, write_mesh, write_points
 from sl_nerfstudio.meshing.finish import (
-    ClosedField,
     Decimated,
     FilledHoles,
     MarkedMesh,
     Planes,
+    closed_field,
     decimate,
     fill_holes,
     hull_planes,
@@ -293,10 +293,15 @@ def build_surface(model: TrainedModel, settings: ExportSettings) -> ExtractedSur
     return replace(surface, marked=surface.marked.largest_component(), other_pieces=pieces - 1)
 
 
+def _zero_level(field: Field, model: TrainedModel, settings: ExportSettings) -> tuple[Mesh, float]:
+    """The mesh of a field in the scan's world, and how many seconds it took."""
+    start = time.perf_counter()
+    mesh = extract_mesh(field, settings.resolution, device=model.device).mapped(model.S_scene_world.inverse())
+    return mesh, time.perf_counter() - start
+
+
 def _open_surface(model: TrainedModel, settings: ExportSettings) -> ExtractedSurface:
-    start, world = time.perf_counter(), model.S_scene_world.inverse()
-    whole = extract_mesh(model.sdf, settings.resolution, device=model.device).mapped(world)
-    seconds = time.perf_counter() - start
+    whole, seconds = _zero_level(model.sdf, model, settings)
     trimmed = filled = cut = None
     marked = MarkedMesh(whole, np.zeros(len(whole.vertices), dtype=bool))
     if not settings.keep_unobserved:
@@ -316,10 +321,8 @@ def _solid(model: TrainedModel, settings: ExportSettings) -> ExtractedSurface:
     What nobody observed is cut off flat where it leaves the convex hull of what was observed, the planes around the
     object, or the box of the field: there the field knows nothing, and bulges.
     """
-    scan, poses, world = model.scan, model.poses(), model.S_scene_world.inverse()
-    start = time.perf_counter()
-    whole = extract_mesh(model.sdf, settings.resolution, device=model.device).mapped(world)
-    first = time.perf_counter() - start
+    scan, poses = model.scan, model.poses()
+    whole, first = _zero_level(model.sdf, model, settings)
     trimmed = trim_to_observed(whole, scan, poses)
     real = trimmed.observed & whole.corners_of(trimmed.kept)
     planes, found = [], separate_scan(scan, poses) if settings.object_only else None
@@ -327,10 +330,7 @@ def _solid(model: TrainedModel, settings: ExportSettings) -> ExtractedSurface:
         real &= found.keeps(whole.vertices)
         planes = planes_below(found, model.S_scene_world)
     planes += hull_planes(model.S_scene_world.points(whole.vertices[real]), 2 / settings.resolution)
-    start = time.perf_counter()
-    field = ClosedField(model.sdf, planes, model.device)
-    solid = extract_mesh(field, settings.resolution, device=model.device).mapped(world)
-    second = time.perf_counter() - start
+    solid, second = _zero_level(closed_field(model.sdf, planes, model.device), model, settings)
     observed = _same_vertices(solid, whole, real)
     piece = solid.component_of_faces()
     kept = np.bincount(piece, observed[solid.faces].all(1).astype(float))[piece] > 0

@@ -391,19 +391,14 @@ def check_run(path: Path) -> RunCheck:
     scan = _scan_folder(config)
     there = (scan / "transforms.json").is_file()
     fingerprint = scan_fingerprint(read_scan(scan)) if there else config.pipeline.scan_fingerprint
+    named = ""
     try:
         require_settings(file, config)
         for checkpoint in good:
-            _require_together(config, checkpoint, scan, fingerprint)
+            named = f"{checkpoint.path}: "
+            require_together(config.pipeline, checkpoint.weights, scan, fingerprint)
     except UserError as error:
-        faults.append(str(error))
+        faults.append(f"{named}{error}")
     if faults:
         raise UserError("\n".join(faults))
     return RunCheck(file.absolute().parent, config, good[-1], len(saved), scan, there)
-
-
-def _require_together(config: Any, checkpoint: Checkpoint, scan: Path, fingerprint: str) -> None:
-    try:
-        require_together(config.pipeline, checkpoint.weights, scan, fingerprint)
-    except UserError as error:
-        raise UserError(f"{checkpoint.path}: {error}") from error

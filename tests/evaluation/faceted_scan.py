@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy import ndarray
+from scipy.ndimage import map_coordinates
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
@@ -134,11 +135,6 @@ def dots(device: Device) -> ndarray:
 
 def bilinear(image: ndarray, uv: ndarray) -> ndarray:
     """Look-up with pixel centres at .5; 0 for NaN."""
-    x, y = np.nan_to_num(uv[..., 0], nan=0.5) - 0.5, np.nan_to_num(uv[..., 1], nan=0.5) - 0.5
-    h, w = image.shape
-    x, y = np.clip(x, 0, w - 1), np.clip(y, 0, h - 1)
-    i, j = np.minimum(y.astype(int), h - 2), np.minimum(x.astype(int), w - 2)
-    a, b = y - i, x - j
-    f = image.astype(np.float64)
-    value = (1 - a) * ((1 - b) * f[i, j] + b * f[i, j + 1]) + a * ((1 - b) * f[i + 1, j] + b * f[i + 1, j + 1])
+    place = np.moveaxis(np.nan_to_num(uv)[..., ::-1] - 0.5, -1, 0)
+    value = map_coordinates(image.astype(np.float64), place, order=1, mode="nearest")
     return np.where(np.isnan(uv[..., 0]), 0.0, value)

@@ -84,17 +84,17 @@ def test_json_has_what_the_command_promises_and_repeats_with_the_seed(scan: Scan
     assert content["units"] == content["truth_units"] == "mm"
     for name in ("rigid", "similarity", "none"):
         block = content[name]
-        for distances in ("accuracy", "completeness"):
-            assert set(block[distances]) == {"mean", "median", "rmse", "p95"}
-        assert set(block) >= {"chamfer", "f_score", "scale"}
-        assert all(0 <= value <= 1 for value in block["f_score"].values())
+        assert set(block) >= {"accuracy", "completeness", "chamfer", "f_score", "scale"}
+        assert all(set(block[key]) == {"mean", "median", "rmse", "p95"} for key in ("accuracy", "completeness"))
         assert [float(d) for d in block["f_score"]] == sorted(float(d) for d in block["f_score"])
     for device in ("camera", "projector"):
         assert set(content[device]) >= {"translation_rmse", "rotation_rmse_deg"}
     assert set(content["fit"]) >= {"coordinate_px_median", "epipolar_px_median", "pattern_cosine", "frames"}
-    assert content["verdict"] in ("good", "acceptable", "poor") and isinstance(content["reasons"], list)
     assert set(content["fit"]["frames"][0]) >= {"coordinate_px_p95", "covered_share", "agreeing_share", "largest_hole"}
     assert len(content["cross_frame"]["frames"]) == 3
+    alone = as_json(evaluate(TRUTH, scan, scan.poses))  # without truth
+    assert set(alone) == {"format", "verdict", "reasons", "units", "fit", "coverage", "cross_frame"}
+    assert alone["fit"]["coordinate_px_median"] < 1e-3
 
 
 def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(scan: Scan) -> None:
@@ -107,12 +107,6 @@ def test_a_scan_of_unknown_unit_is_judged_in_that_of_the_truth(scan: Scan) -> No
     assert (content["units"], content["truth_units"]) == ("arbitrary", "units of the truth")
     assert 0.1 < content["similarity"]["accuracy"]["rmse"] < 1.0
     assert content["camera"]["translation_rmse"] < 1e-6
-
-
-def test_without_truth_only_the_fit_is_there(scan: Scan) -> None:
-    content = as_json(evaluate(TRUTH, scan, scan.poses))
-    assert set(content) == {"format", "verdict", "reasons", "units", "fit", "coverage", "cross_frame"}
-    assert content["fit"]["coordinate_px_median"] < 1e-3
 
 
 def test_initial_pose_errors_are_those_that_were_put_in(tmp_path: Path) -> None:
@@ -139,17 +133,13 @@ def test_figures_do_not_depend_on_the_unit(tmp_path: Path) -> None:
     assert m["fit"]["coordinate_px_median"] == pytest.approx(mm["fit"]["coordinate_px_median"], rel=1e-3)
 
 
-def test_mesh_in_another_unit_is_refused_with_the_sizes(scan: Scan) -> None:
+def test_a_mesh_in_another_unit_and_a_reference_inside_out_are_refused(scan: Scan) -> None:
     far = Mesh(TRUTH.vertices / 1000 + 500.0, TRUTH.faces)
     said = r"no camera ray .* hits the mesh\n.*mesh measures 0\.1\d*, and the cameras are .* away .*mm"
     with pytest.raises(UserError, match=rf"{said}[\s\S]*remedy: give the mesh that was exported from this scan"):
         evaluate(far, scan, scan.poses)
-
-
-def test_reference_inside_out_is_refused(scan: Scan) -> None:
-    turned = Mesh(TRUTH.vertices, TRUTH.faces[:, ::-1].copy())
     with pytest.raises(UserError, match="inside out"):
-        mesh_reference(turned, scan, scan.poses, SAMPLES)
+        mesh_reference(Mesh(TRUTH.vertices, TRUTH.faces[:, ::-1].copy()), scan, scan.poses, SAMPLES)
 
 
 def whole(surface: IndexedMesh) -> MeshReference:
@@ -193,22 +183,10 @@ def test_reference_points_are_compared_and_aligned_too() -> None:
     assert 0.2 * spacing < score.accuracy.median < spacing  # triangles to points: their spacing
 
 
-def test_signed_distance_is_negative_inside() -> None:
-    found = IndexedMesh(sphere(10.0, 100)).signed_distance(np.array([[0, 0, 11.0], [0, 0, 9.0], [9.5, 0, 0]]))
-    np.testing.assert_allclose(found, [1, -1, -0.5], atol=0.01)
-
-
-@pytest.mark.parametrize(
-    ("size", "expected"),
-    [
-        (110.0, (0.1, 0.2, 0.5, 1.0)),
-        (0.11, (1e-4, 2e-4, 5e-4, 1e-3)),
-        (60.0, (0.05, 0.1, 0.25, 0.5)),
-        (1.0, (1e-3, 2e-3, 5e-3, 1e-2)),
-    ],
-)
-def test_default_distances_are_round_and_follow_the_unit(size: float, expected: tuple[float, ...]) -> None:
-    assert default_f_distances(size) == expected
+def test_default_distances_are_round_and_follow_the_unit() -> None:
+    for size, expected in ((110.0, (0.1, 0.2, 0.5, 1.0)), (0.11, (1e-4, 2e-4, 5e-4, 1e-3)),
+                           (60.0, (0.05, 0.1, 0.25, 0.5)), (1.0, (1e-3, 2e-3, 5e-3, 1e-2))):  # fmt: skip
+        assert default_f_distances(size) == expected
 
 
 FRAMES = 3
@@ -302,14 +280,14 @@ def test_pairs_are_read_as_they_are_written(tmp_path):
     for bad in ("1,2,3", "1,2,3 4,5", "1 2 3 4 5 6", ": 1,2,3 4,5,6", "1,2,3 4,5,nan"):
         with pytest.raises(UserError, match=r"is not two points\n    remedy: give x,y,z of both"):
             parse_pair(bad, "--distance")
-    file.write_text("ok: 0,0,0 1,1,1\nbad: 0,0,0\n")
-    with pytest.raises(UserError, match=r"features.txt, line 2: 'bad: 0,0,0' is not two points"):
-        read_pairs(file)
-    file.write_text("# nothing\n")
-    with pytest.raises(UserError, match="holds no distances"):
-        read_pairs(file)
-    with pytest.raises(UserError, match="cannot be read"):
-        read_pairs(tmp_path / "missing.txt")
+    for text, message in (
+        ("ok: 0,0,0 1,1,1\nbad: 0,0,0\n", r"features.txt, line 2: 'bad: 0,0,0' is not two points"),
+        ("# nothing\n", "holds no distances"),
+        (None, "cannot be read"),
+    ):
+        file.unlink() if text is None else file.write_text(text)
+        with pytest.raises(UserError, match=message):
+            read_pairs(file)
 
 
 def test_points_beside_the_mesh_are_refused(scan):

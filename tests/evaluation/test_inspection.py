@@ -7,7 +7,7 @@ from sl_nerfstudio.evaluation.inspection import deviation_colours, inspect
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh, VertexQuality
 
-from .parts import ANYWHERE, bracket, scanned
+from .shapes import ANYWHERE, bracket, scanned
 
 SIGMA, ERROR, RADIUS = 0.02, 0.2, 6.0
 PLACE = np.array([40.0, 10.0, 15.0])  # on the upper side of the longer wall

@@ -42,23 +42,30 @@ def test_what_is_wrong_with_the_intrinsics_comes_first() -> None:
     assert judge(GOOD, "The camera is too long").next_steps == ["The camera is too long"]
 
 
-def test_a_frame_that_training_could_not_place_makes_the_scan_poor() -> None:
+def test_a_frame_that_was_not_placed_makes_the_scan_poor_and_one_far_from_its_start_is_not_good() -> None:
     verdict = judge(GOOD, unplaced=["frame_00001"]).verdict
     assert verdict.band == "poor" and verdict.reasons[0].startswith("frame_00001: could not be placed")
-
-
-def test_a_frame_far_from_its_start_is_not_good_and_one_that_was_not_placed_is_named_once() -> None:
     departed = [DepartedFrame("frame_00001", 19.86, 1.0)]
     verdict = judge(GOOD, departed=departed).verdict
     assert verdict.band == "acceptable" and verdict.reasons[0].startswith("frame_00001 (19.9 deg, stated 1): far from")
-    assert len(judge(GOOD, unplaced=["frame_00001"], departed=departed).verdict.reasons) == 1
+    assert len(judge(GOOD, unplaced=["frame_00001"], departed=departed).verdict.reasons) == 1  # named once
 
 
-@pytest.mark.parametrize(("sigma", "band"), [(0.002, "good"), (0.008, "acceptable"), (0.05, "poor")])
-def test_lengths_that_are_badly_known_are_no_good_scan(sigma: float, band: str) -> None:
-    verdict = judge(GOOD, length_sigma=sigma)
-    assert verdict.verdict.band == band
-    assert [f.text for f in verdict.figures if f.name == "Sigma of lengths"] == [f"{100 * sigma:.2f} %"]
+@pytest.mark.parametrize(
+    ("given", "band", "text"),
+    [
+        ({"length_sigma": 0.002}, "good", "0.20 %"),
+        ({"length_sigma": 0.008}, "acceptable", "0.80 %"),
+        ({"length_sigma": 0.05}, "poor", "5.00 %"),
+        ({"steps": TrainedSteps(1000, 1000)}, "good", "100 % (1000 of 1000 steps)"),
+        ({"steps": TrainedSteps(400, 1000)}, "acceptable", "40 % (400 of 1000 steps)"),
+        ({"steps": TrainedSteps(40, 1000)}, "poor", "4 % (40 of 1000 steps)"),
+    ],
+)
+def test_badly_known_lengths_and_an_unfinished_training_show(given: dict, band: str, text: str) -> None:
+    verdict = judge(GOOD, **given)
+    assert verdict.verdict.band == band and verdict.figures[-1].text == text
+    assert (text in " ".join(verdict.verdict.reasons)) == (band != "good")
 
 
 def _with(**changes) -> dict:
@@ -156,9 +163,9 @@ def test_a_frame_that_disagrees_is_named_with_what_to_do(change):
 
 
 def test_frames_are_not_blamed_if_nothing_or_everything_disagrees():
-    assert disagreeing_frames(REFINED) == ()
     everywhere = tuple(replace(frame, agreeing_share=0.1) for frame in FRAMES)
-    assert disagreeing_frames(replace(REFINED, agreement=replace(AGREEMENT, frames=everywhere))) == ()
+    for frames in (FRAMES, everywhere):
+        assert disagreeing_frames(replace(REFINED, agreement=replace(AGREEMENT, frames=frames))) == ()
 
 
 def test_the_next_capture_is_named_by_its_side():
@@ -187,14 +194,6 @@ def test_holes_and_missing_surface_are_judged():
     assert judged["Holes"].acceptable == "any"  # nobody can judge what nobody saw
     closed = assess_completeness(IndexedMesh(cut_sphere()), REFINED.agreement)
     assert closed.hole_share == 0 and closed.rim_area == 0 and closed.observed == pytest.approx(0.999)
-
-
-@pytest.mark.parametrize(("done", "band"), [(1000, "good"), (400, "acceptable"), (40, "poor")])
-def test_an_unfinished_training_shows(done, band):
-    verdict = judge(REFINED, steps=TrainedSteps(done, 1000))
-    assert verdict.verdict.band == band
-    if band != "good":
-        assert f"({done} of 1000 steps)" in verdict.verdict.reasons[0]
 
 
 def test_steps_are_those_of_the_training_and_the_recommended_ones():

@@ -9,8 +9,7 @@ from sl_nerfstudio.evaluation.part_alignment import facet_sag, place_on_part
 from sl_nerfstudio.geometry.lie import Similarity, angle_deg
 from tests.meshing.solids import mesh_of
 
-from .parts import ANYWHERE, bracket, facing, scanned
-from .shapes import blob
+from .shapes import ANYWHERE, blob, bracket, facing, scanned
 
 
 @pytest.mark.slow

@@ -74,13 +74,6 @@ def test_icp_with_scale_may_not_collapse_onto_a_patch() -> None:
     assert found.S_target_source.scale >= 1 / 1.5 - 1e-12
 
 
-def moved(T: np.ndarray, offset: np.ndarray, R: np.ndarray) -> np.ndarray:
-    out = T.copy()
-    out[:, :3, 3] += offset
-    out[:, :3, :3] = R @ T[:, :3, :3]
-    return out
-
-
 def test_the_gauge_is_not_an_error_and_scale_is_reported_separately() -> None:
     camera, projector = random_poses(5, 0), random_poses(5, 1)
     S = Similarity(1.02, turn((1, 1, 0), 40.0), np.array([100.0, 0.0, -50.0]))
@@ -94,7 +87,8 @@ def test_the_gauge_is_not_an_error_and_scale_is_reported_separately() -> None:
 def test_one_bad_frame_among_many_shows_its_own_error() -> None:
     camera, projector = random_poses(200, 0), random_poses(200, 1)
     bad = camera.copy()
-    bad[7] = moved(camera[7:8], np.array([3.0, 4.0, 0.0]), turn((0, 1, 0), 2.0))[0]
+    bad[7, :3, :3] = turn((0, 1, 0), 2.0) @ bad[7, :3, :3]
+    bad[7, :3, 3] += [3.0, 4.0, 0.0]
     errors = compare_poses(DevicePoses(bad, projector), DevicePoses(camera, projector))
     assert errors.camera.translation[7] == pytest.approx(5.0, rel=0.02)
     assert errors.camera.rotation_deg[7] == pytest.approx(2.0, rel=0.02)

@@ -8,10 +8,10 @@ from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.evaluation.shape_fits import FittedShape, fit_shape, parse_region
 from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.meshing.uncertainty import Smoothing
+from sl_nerfstudio.meshing.uncertainty import smoothing
 from tests.meshing.solids import mesh_of
 
-from .parts import scanned
+from .shapes import scanned
 
 HERE = Similarity.identity()
 CYLINDER = scanned(mesh_of(trimesh.creation.cylinder(15, 50, sections=200)), edge=1.5, noise=0.0, S=HERE)
@@ -45,7 +45,7 @@ def test_exact_surfaces_give_exact_shapes_and_stray_pieces_do_not_count(text: st
 @pytest.mark.parametrize("text", CASES)
 def test_errors_that_neighbours_share_are_as_large_as_their_sigma_says(text: str) -> None:
     mesh, radius = CASES[text]
-    normals, smooth = mesh.vertex_normals(), Smoothing(mesh, 10.0)
+    normals, smooth = mesh.vertex_normals(), smoothing(mesh, 10.0)
     scores = []
     for seed in range(30):
         off = smooth(np.random.default_rng(seed).normal(size=len(normals)))

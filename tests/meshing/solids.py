@@ -1,14 +1,34 @@
 """Meshes of known shape, and several of them as one."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
+import torch
 import trimesh
 
+from sl_nerfstudio.geometry.lie import Similarity
+from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 
 
 def mesh_of(solid: trimesh.Trimesh, scale: float = 1.0) -> Mesh:
     """A mesh of trimesh as ours."""
     return Mesh(np.asarray(solid.vertices, dtype=np.float64) * scale, np.asarray(solid.faces, dtype=np.int64))
+
+
+def extracted(
+    distance: Callable[[torch.Tensor], torch.Tensor], cells: int, half: float, centre: Sequence[float] = (0.0, 0.0, 0.0)
+) -> Mesh:
+    """The zero level of a distance in a cube about a centre."""
+    middle = torch.tensor(centre)
+    box = Similarity(half, np.eye(3), np.array(centre))
+    return extract_mesh(lambda p: distance(half * p + middle) / half, cells).mapped(box)
+
+
+def ball(centre: Sequence[float], radius: float, cell: float = 1.5) -> Mesh:
+    """A ball of cells of about one size."""
+    half, middle = radius + 2 * cell, torch.tensor(centre)
+    return extracted(lambda p: (p - middle).norm(dim=-1) - radius, round(2 * half / cell), half, centre)
 
 
 def together(*parts: Mesh) -> Mesh:

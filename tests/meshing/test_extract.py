@@ -48,9 +48,16 @@ def test_closed_analytic_surfaces(sdf, euler, volume, resolution):
     assert len(np.unique(mesh.faces)) == len(mesh.vertices)
 
 
-def test_error_falls_with_the_square_of_the_cell():
+@pytest.fixture
+def unpolished(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Vertices stay where linear interpolation puts them."""
+    monkeypatch.setattr(extract, "POLISH", 0)
+
+
+def test_error_falls_with_the_square_of_the_cell(monkeypatch):
     def rms(resolution: int, polish: int) -> float:
-        mesh = extract_mesh(torus, resolution, polish=polish)
+        monkeypatch.setattr(extract, "POLISH", polish)
+        mesh = extract_mesh(torus, resolution)
         middle = mesh.vertices[mesh.faces].mean(1)
         return float(torus(torch.from_numpy(middle)).square().mean().sqrt())
 
@@ -58,6 +65,7 @@ def test_error_falls_with_the_square_of_the_cell():
     assert rms(64, 1) < 0.9 * rms(64, 0)
 
 
+@pytest.mark.usefixtures("unpolished")
 def test_same_vertices_as_dense_marching_cubes():
     """Scikit-image on the full grid is an independent implementation; a smooth surface has no ambiguous cells."""
 
@@ -67,12 +75,13 @@ def test_same_vertices_as_dense_marching_cubes():
     axis = torch.linspace(-1, 1, 41, dtype=torch.float64)
     dense = shifted(torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3).float())
     expected = marching_cubes(dense.reshape(41, 41, 41).numpy(), 0.0, spacing=(0.05,) * 3)[0] - 1
-    ours = extract_mesh(shifted, 40, polish=0).vertices
+    ours = extract_mesh(shifted, 40).vertices
     assert len(ours) == len(expected)
     there, back = KDTree(expected).query(ours)[0], KDTree(ours).query(expected)[0]
     assert max(there.max(), back.max()) < 1e-4
 
 
+@pytest.mark.usefixtures("unpolished")
 @pytest.mark.parametrize("seed", range(3))
 def test_noise_with_every_ambiguous_case_is_a_closed_surface(seed):
     """A lattice of random signs meets all 256 cases; no edge may have other than two triangles."""
@@ -85,40 +94,32 @@ def test_noise_with_every_ambiguous_case_is_a_closed_surface(seed):
         grid = p.reshape(1, 1, 1, -1, 3)  # grid_sample takes (x, y, z) for the last, middle and first axis
         return torch.nn.functional.grid_sample(value[None, None], grid, align_corners=True).reshape(-1)
 
-    mesh = extract_mesh(field, n, polish=0)
+    mesh = extract_mesh(field, n)
     assert set(triangles_at_edges(mesh)[1]) == {2}
     assert solid(mesh).is_winding_consistent and solid(mesh).volume > 0
 
 
+@pytest.mark.usefixtures("unpolished")
 @pytest.mark.parametrize("factor", [0.2, 30.0])
 def test_a_field_that_is_no_distance_gives_the_same_surface(factor):
     """Flat or steep, and steep only near the surface, where the coarse look-out cannot know it."""
-    steep = extract_mesh(lambda p: factor * torus(p), 48, polish=0)
-    late = extract_mesh(
-        lambda p: torch.sign(torus(p)) * (torus(p).abs() * 50).clamp_max(0.5 + torus(p).abs()), 64, polish=0
-    )
-    plain = extract_mesh(torus, 48, polish=0)
+    steep, plain = extract_mesh(lambda p: factor * torus(p), 48), extract_mesh(torus, 48)
+    late = extract_mesh(lambda p: torch.sign(torus(p)) * (torus(p).abs() * 50).clamp_max(0.5 + torus(p).abs()), 64)
     np.testing.assert_allclose(steep.vertices, plain.vertices, atol=1e-5)
     assert solid(late).is_watertight and solid(late).euler_number == 0
 
 
-def test_surface_is_followed_out_of_the_blocks_that_were_found():
+@pytest.mark.usefixtures("unpolished")
+def test_surface_is_followed_out_of_the_blocks_that_were_found(monkeypatch):
     """Huge values everywhere except in one ball: only there is the surface found, the rest must be followed."""
 
     def field(p):
         near = (p - p.new_tensor([0.5, 0.0, 0.0])).norm(dim=-1) < 0.2
         return torch.where(near, sphere(p), sphere(p).sign() * 10)
 
-    closed = solid(extract_mesh(field, 64, safety=0.05, polish=0))
+    monkeypatch.setattr(extract, "SAFETY", 0.05)
+    closed = solid(extract_mesh(field, 64))
     assert closed.is_watertight and closed.euler_number == 2
-
-
-def test_a_box_that_is_no_cube_and_not_centred():
-    mesh = extract_mesh(
-        lambda p: (p - p.new_tensor([3.0, 1.0, 0.2])).norm(dim=-1) - 0.15, 61, (2.0, 0.5, 0.0), (4.0, 1.5, 0.4)
-    )
-    assert solid(mesh).is_watertight and solid(mesh).euler_number == 2
-    np.testing.assert_allclose(np.linalg.norm(mesh.vertices - [3.0, 1.0, 0.2], axis=1), 0.15, atol=1e-3)
 
 
 def test_a_surface_that_leaves_the_box_is_open_there_only():
@@ -133,24 +134,17 @@ def test_a_surface_that_leaves_the_box_is_open_there_only():
     assert solid(mesh).euler_number == 1  # one sheet without holes
 
 
-def test_only_points_near_the_surface_are_evaluated():
+def test_only_points_near_the_surface_are_evaluated_in_bounded_chunks_of_float32():
     count = 0
 
     def counted(p):
         nonlocal count
         count += len(p)
-        return sphere(p)
-
-    mesh = extract_mesh(counted, 256)
-    assert count < 0.06 * 256**3 and count < 12 * len(mesh.vertices)
-
-
-def test_field_gets_float32_points_inside_the_box_in_bounded_chunks():
-    def checked(p):
         assert p.dtype == torch.float32 and p.abs().max() <= 1.0 and len(p) <= 1 << 18
-        return torus(p)[:, None]  # a column, as networks give it
+        return sphere(p)[:, None]  # a column, as networks give it
 
-    extract_mesh(checked, 97)
+    mesh = extract_mesh(counted, 255)
+    assert count < 0.06 * 255**3 and count < 12 * len(mesh.vertices)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Colours of vertices and textures of a ball whose colour is a function of the place."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,20 +8,55 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image
-from scipy.ndimage import distance_transform_edt
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.numerics import component_labels
 from sl_nerfstudio.meshing import texture as module
 from sl_nerfstudio.meshing.files import files_of, read_mesh, write_mesh
 from sl_nerfstudio.meshing.finish import decimate
-from sl_nerfstudio.meshing.mesh import GREY, Charts, Mesh, as_linear, as_srgb
+from sl_nerfstudio.meshing.mesh import GREY, Mesh, as_linear, as_srgb
 from sl_nerfstudio.meshing.texture import Colours, Pictures, Textured, draw_triangles, square_charts, surface_texture
 from sl_nerfstudio.scan import Scan
 from sl_nerfstudio.scan.images import encode_png
+from tests.formulas import on_ball, rays
 
-from .coloured_ball import BALL, PINHOLE, RADIUS, angle_cosines, colour_at, coloured_scan, picture
+from .ray_cast_scan import pairs_around, scan_of
 from .solids import mesh_of, together
+
+RADIUS = 40.0
+BALL = mesh_of(trimesh.creation.icosphere(4, RADIUS))
+PINHOLE = Device(w=128, h=112, fl_x=300.0, fl_y=310.0, cx=60.0, cy=58.0)
+Colour = Callable[[np.ndarray], np.ndarray]
+
+
+def colour_at(p: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1]: three different gradients, of which none is symmetric in the image."""
+    return 0.5 + p / (2.5 * RADIUS)
+
+
+def picture(T_world_camera: np.ndarray, camera: Device = PINHOLE, colour: Colour = colour_at) -> np.ndarray:
+    """What a pinhole camera sees of the ball, by the formulas of the format; black beside it."""
+    p = on_ball(*rays(camera, T_world_camera), RADIUS)
+    return np.round(np.nan_to_num(colour(p)) * 255).astype(np.uint8)
+
+
+def coloured_scan(root: Path, pictures: int, camera: Device = PINHOLE, colour: Colour = colour_at) -> Scan:
+    """Four captures from above, of which the first ones were also taken without the pattern."""
+    scan = scan_of(BALL, pairs_around(4, 40), root, camera=camera)
+    (root / "color").mkdir()
+    frames = list(scan.frames)
+    for k, frame in enumerate(frames[:pictures]):
+        path = root / f"color/{frame.name}.png"
+        path.write_bytes(encode_png(picture(frame.T_world_camera, camera, colour)))
+        frames[k] = replace(frame, color_path=path)
+    return replace(scan, frames=tuple(frames))
+
+
+def angle_cosines(scan: Scan, frames: range, points: np.ndarray) -> np.ndarray:
+    """Cosine between the ball's normal and the line of sight, of each frame and point of the ball."""
+    eyes = np.stack([scan.frames[k].T_world_camera[:3, 3] for k in frames])
+    way = eyes[:, None] - points
+    return (way * points).sum(2) / np.linalg.norm(way, axis=2) / RADIUS
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +176,9 @@ def mesh(request) -> Mesh:
 
 @pytest.fixture(scope="module")
 def textured(mesh, waving) -> Textured:
-    return surface_texture(mesh, 768, BALL, Pictures(BALL, waving, waving.poses))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "_PIECE", 1500 if mesh is BALL else 10**9)
+        return surface_texture(mesh, 768, BALL, Pictures(BALL, waving, waving.poses))
 
 
 def loaded(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray, Image.Image]:
@@ -194,18 +232,21 @@ def test_smaller_copies_of_the_image_show_nothing_from_between_the_charts(mesh, 
     assert image.min() / 255 > 0.19 and image.max() / 255 < 0.81
 
 
-def test_figures_of_a_texture(mesh, textured):
-    """The side of a pixel: as many of them as are inside triangles have the area of the surface."""
-    assert 0.4 < textured.seen < 0.9
-    uv = textured.texture.charts.uv[textured.texture.charts.corners].astype(float) * 768
-    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    pixels = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
-    area = trimesh.Trimesh(mesh.vertices, mesh.faces).area
-    assert textured.texel == pytest.approx((area / pixels) ** 0.5, rel=1e-6)
+def test_charts_have_one_scale_which_is_said(mesh, textured):
+    charts = textured.texture.charts
+    assert np.array_equal(charts.vertex[charts.corners], mesh.faces)
+    assert charts.uv.min() >= 0 and charts.uv.max() <= 1 and 0.4 < textured.seen < 0.9
+    flat = trimesh.triangles.area(np.pad(charts.uv.astype(float), ((0, 0), (0, 1)))[charts.corners])
+    scale = np.sqrt(flat / mesh.face_areas())
+    assert 0.25 < flat.sum() < 1 and np.percentile(scale, 99) / np.percentile(scale, 1) < 1.5
+    number = component_labels(charts.corners[:, :2].ravel(), charts.corners[:, 1:].ravel(), len(charts.uv))
+    assert len(np.unique(number)) == charts.count
+    assert textured.texel == pytest.approx((mesh.face_areas().sum() / flat.sum()) ** 0.5 / 768, rel=1e-6)
 
 
 def test_parts_of_a_texture_are_coloured_like_the_whole(waving, mesh, textured, monkeypatch):
     monkeypatch.setattr(module, "_AT_A_TIME", 50_000)
+    monkeypatch.setattr(module, "_PIECE", 1500 if mesh is BALL else 10**9)
     again = surface_texture(mesh, 768, BALL, Pictures(BALL, waving, waving.poses))
     assert np.array_equal(again.texture.image, textured.texture.image)
 
@@ -228,68 +269,15 @@ def test_formats_without_textures(suffix, mesh, textured, tmp_path):
 
 
 KNOT = trimesh.creation.torus(30.0, 11.0, major_sections=48, minor_sections=24)
-BOX = trimesh.creation.box((30, 20, 10)).subdivide_to_size(4.0)
-SOLIDS = {"torus": KNOT, "box": BOX}
 
 
-def drawn(charts: Charts, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """How many triangles the centre of each pixel is inside of, and the chart there; -1 where there is none."""
-    number = component_labels(charts.corners[:, :2].ravel(), charts.corners[:, 1:].ravel(), len(charts.uv))
-    count, chart = np.zeros((size, size), int), np.full((size, size), -1)
-    for triangle in charts.corners:
-        corners = charts.uv[triangle].astype(float) * size
-        (left, top), (right, bottom) = np.floor(corners.min(0)).astype(int), np.ceil(corners.max(0)).astype(int)
-        x, y = np.meshgrid(np.arange(left, right) + 0.5, np.arange(top, bottom) + 0.5)
-        sides = [
-            (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0])
-            for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)
-        ]
-        inside = (np.array(sides) > 1e-4).all(0) | (np.array(sides) < -1e-4).all(0)
-        count[top:bottom, left:right] += inside
-        chart[top:bottom, left:right][inside] = number[triangle[0]]
-    return count, chart
-
-
-def areas(points: np.ndarray) -> np.ndarray:
-    """Of triangles (f, 3, 2 or 3), by Heron's formula."""
-    a, b, c = (np.linalg.norm(points[:, k] - points[:, k - 1], axis=1) for k in range(3))
-    s = (a + b + c) / 2
-    return np.sqrt(np.maximum(s * (s - a) * (s - b) * (s - c), 0))
-
-
-@pytest.mark.parametrize("pieces", ["whole", "in pieces"])
-@pytest.mark.parametrize("name", SOLIDS)
-def test_charts_lie_inside_the_square_and_not_over_each_other(name, pieces, monkeypatch):
-    monkeypatch.setattr(module, "_PIECE", 700 if pieces == "in pieces" else 10**9)
-    mesh, size = mesh_of(SOLIDS[name]), 512
-    charts = square_charts(mesh, size)
-    assert charts.uv.min() >= 0 and charts.uv.max() <= 1
-    assert np.array_equal(charts.vertex[charts.corners], mesh.faces)
-    count, chart = drawn(charts, 2 * size)
-    flat = areas(charts.uv[charts.corners].astype(float))
-    assert count.max() == 1 and count.mean() == pytest.approx(flat.sum(), rel=0.02)
-    assert 0.25 < flat.sum() < 1 and (flat > 0).all()
-    # every triangle at about the same scale
-    scale = np.sqrt(flat / areas(mesh.vertices[mesh.faces]))
-    assert np.percentile(scale, 99) / np.percentile(scale, 1) < 1.5
-    # two pixels of the texture between charts, so that a filter of two by two pixels never sees another one
-    for one in np.unique(chart[chart >= 0])[:20]:
-        away = distance_transform_edt(chart != one)
-        assert away[(chart >= 0) & (chart != one)].min() >= 2 * 2
-    assert len(np.unique(chart[chart >= 0])) == charts.count
-
-
-def test_the_unit_and_the_place_of_a_mesh_do_not_matter():
+def test_the_unit_and_the_place_of_a_mesh_do_not_matter_and_a_small_texture_has_few_charts():
     plain, tiny = (square_charts(mesh_of(KNOT, scale), 256) for scale in (1.0, 1e-5))
     far = square_charts(Mesh(mesh_of(KNOT).vertices + 1e4, mesh_of(KNOT).faces), 256)
     for other in (tiny, far):
         assert np.array_equal(plain.corners, other.corners)
         np.testing.assert_allclose(plain.uv, other.uv, atol=0.02)
-
-
-def test_a_small_texture_has_few_charts():
-    counts = [square_charts(mesh_of(KNOT), size).count for size in (64, 512)]
-    assert counts[0] < 30 < counts[1]
+    assert square_charts(mesh_of(KNOT), 64).count < 30 < square_charts(mesh_of(KNOT), 512).count
 
 
 def test_degenerate_triangles_cover_nothing():

@@ -6,25 +6,18 @@ from itertools import product
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Float
-from numpy import ndarray
+from scipy.ndimage import binary_dilation, distance_transform_cdt
 
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, exp_se3, exp_so3
-from sl_nerfstudio.geometry.triangulation import pixel_rays, world_pixels
-from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.meshing.visibility import (
     ENOUGH,
     LEAST_PX,
     OFF_MASK_PX,
-    FrameCounts,
     Occluder,
     Trimmed,
-    compare_decoded,
     count_frames,
-    packed_device,
     trim_to_observed,
     visible_vertices,
 )
@@ -32,7 +25,7 @@ from sl_nerfstudio.scan import Scan
 from tests.formulas import pixels
 
 from .ray_cast_scan import CAMERA, PROJECTOR, look_at, pairs_around, scan_of
-from .solids import plate, together, triangles_at_edges
+from .solids import ball, extracted, plate, together, triangles_at_edges
 
 POSES = (look_at((60.0, 0.0, 290.0)), look_at((-40.0, 30.0, 290.0)))
 
@@ -73,27 +66,27 @@ def test_a_surface_at_another_height_is_predicted_wrong_by_the_parallax(scan):
 
 def test_outside_the_mask_the_distance_in_pixels_decides(scan):
     """The mesh goes on beyond the true plate."""
-    mesh = plate(45.0, 1.0)
+    mesh, mask = plate(45.0, 1.0), scan.frames[0].read_mask()
     view = seen(mesh, scan)
-    corners = pixels(CAMERA, POSES[0], plate(30.0, 60.0).vertices)
-    points = pixels(CAMERA, POSES[0], mesh.vertices[view.vertex])
-    outside = distance_from_quadrilateral(points, corners[[0, 1, 3, 2]])
-    assert view.off_mask[outside > 1.5 * OFF_MASK_PX + 1.5].all()  # a square of pixels grows to its corners
-    assert not view.off_mask[outside < OFF_MASK_PX - 1.5].any()
-    assert view.near_mask[(outside > 1.5) & (outside < OFF_MASK_PX - 1.5)].all()
-    assert not view.near_mask[outside < -1.5].any()
+    column, row = np.floor(pixels(CAMERA, POSES[0], mesh.vertices[view.vertex])).astype(int).T
+    away = distance_transform_cdt(~mask, "chessboard")[row, column]
+    assert np.array_equal(view.off_mask, away > OFF_MASK_PX) and view.off_mask.any()
+    assert np.array_equal(view.near_mask, (away > 0) & (away <= OFF_MASK_PX)) and view.near_mask.any()
     assert (np.isnan(view.least) | ~view.off_mask).all()
 
 
-def distance_from_quadrilateral(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Signed distance (negative inside) from a convex polygon; exact near its edges."""
-    centre = corners.mean(0)
-    out = np.full(len(points), -np.inf)
-    for a, b in zip(corners, np.roll(corners, -1, 0), strict=True):
-        normal = np.array([b[1] - a[1], a[0] - b[0]]) / np.linalg.norm(b - a)
-        normal *= -np.sign((centre - a) @ normal)
-        out = np.maximum(out, (points - a) @ normal)
-    return out
+def test_where_pixels_are_undecoded_their_neighbours_are_compared_on_the_tangent_plane(scan, tmp_path):
+    lost = np.random.default_rng(0).random((CAMERA.h, CAMERA.w, 1)) < 0.7
+    holey = scan_of(plate(30.0, 1.0), [POSES], tmp_path, lambda _, c: np.where(lost, np.float32(np.nan), c))
+    decoded, mask = np.isfinite(holey.frames[0].read_coords()).all(-1), holey.frames[0].read_mask()
+    for height in (0.0, 6.0):
+        mesh = plate(20.0, 1.5, height)
+        whole, view = seen(mesh, scan), seen(mesh, holey)
+        column, row = np.floor(pixels(CAMERA, POSES[0], mesh.vertices[view.vertex])).astype(int).T
+        known = binary_dilation(decoded, np.ones((3, 3)))[row, column] & mask[row, column]
+        assert np.array_equal(np.isfinite(view.most), known) and 0 < known.mean() < 1
+        np.testing.assert_allclose(view.most[known], whole.most[known], rtol=0.03, atol=0.05)
+        assert (view.least[known] <= whole.most[known] + 0.05).all()
 
 
 def test_counts_add_up_over_the_frames_and_stop_once_decided(tmp_path):
@@ -119,116 +112,8 @@ def test_undecoded_frames_are_inconclusive_and_wrong_ones_contradict(tmp_path):
     assert np.isnan(counts.residual_px[0]) and counts.residual_px[1] == pytest.approx(40 * 2**0.5, rel=1e-3)
 
 
-def test_decided_vertices_keep_their_counts_in_a_second_pass(scan):
-    mesh = plate(20.0, 2.0)
-    n = len(mesh.vertices)
-    decided = np.arange(n) % 2 == 0
-    before = FrameCounts(
-        np.where(decided, 7, 1), np.full(n, 2), np.zeros(n, dtype=int), np.full(n, 2), residual_px=np.ones(1)
-    )
-    assert np.array_equal(before.decided, decided)  # 7 - 1 against, 1 - 1 against
-    poses = DevicePoses(POSES[0][None], POSES[1][None])
-    after = count_frames(mesh, Occluder(mesh), replace(scan, frames=scan.frames[:1]), poses, before)
-    assert (after.confirmed == np.where(decided, 7, 1)).all()
-    assert (after.inconclusive == np.where(decided, 2, 0)).all() and (after.near_mask == after.inconclusive).all()
-
-
-MOST_PX = 16.0
-COUNT = 3000
-LENS = {"k1": -0.2, "k2": 0.05, "p1": 1e-3, "p2": -2e-3}
-PLAIN = Device(96, 80, 160.0, 150.0, 48.0, 40.0), Device(400, 300, 800.0, 780.0, 200.0, 150.0)
-BENT = Device(96, 80, 160.0, 150.0, 48.0, 40.0, **LENS), Device(400, 300, 800.0, 780.0, 200.0, 150.0, model="DOE")
-
-
-def jacobian(points, normals, uv, devices, poses) -> Float[ndarray, "n 2 2"]:
-    """Derivative of the predicted coordinate by the camera pixel's x and y, on the tangent plane."""
-    columns = []
-    for step in ((1.0, 0.0), (0.0, 1.0)):
-        camera = Intrinsics.of(devices[0], torch.float64)
-        origin, direction = pixel_rays(camera, torch.from_numpy(poses[0]), torch.from_numpy(uv[:, 0] + step))
-        o, d = origin.numpy(), direction.numpy()
-        towards = (d * normals).sum(1)
-        distance = ((points - o) * normals).sum(1) / np.where(towards < 0, towards, -1e-12)
-        there, _ = world_pixels(devices[1], poses[1], o + distance[:, None] * d)
-        columns.append((there - uv[:, 1]).clip(-MOST_PX, MOST_PX))
-    return np.stack(columns, -1)
-
-
-def at(coords: ndarray, row: ndarray, column: ndarray) -> ndarray:
-    return coords[np.clip(row, 0, coords.shape[0] - 1), np.clip(column, 0, coords.shape[1] - 1)].astype(float)
-
-
-def bounds(coords: ndarray, uv: ndarray, J: ndarray) -> tuple[ndarray, ndarray]:
-    """Bounds of the distance, by the rule that the compiled file states; which of them are bilinear."""
-    slope = np.linalg.norm(J, axis=(1, 2))
-    column, row = np.floor(uv[:, 0] - 0.5).astype(int).T
-    corners = np.stack([at(coords, row + dy, column + dx) - uv[:, 1] for dy, dx in product((0, 1), repeat=2)])
-    spread = np.linalg.norm(corners.max(0) - corners.min(0), axis=1)
-    x, y = (uv[:, 0] - 0.5 - np.stack([column, row], 1)).T[:, :, None]
-    value = (1 - y) * ((1 - x) * corners[0] + x * corners[1]) + y * ((1 - x) * corners[2] + x * corners[3])
-    whole = spread <= 2 * slope + 1
-    column, row = np.floor(uv[:, 0]).astype(int).T
-    nine = []
-    for dy, dx in product((-1, 0, 1), repeat=2):
-        away = np.stack([column + dx, row + dy], 1) + 0.5 - uv[:, 0]
-        off = at(coords, row + dy, column + dx) - uv[:, 1] - np.einsum("nij,nj->ni", J, away)
-        distance, bend = np.linalg.norm(off, axis=1), 0.5 * slope * np.linalg.norm(away, axis=1)
-        nine.append(((distance - bend).clip(min=0), distance))
-    best = np.fmin.reduce(np.array(nine))
-    return np.where(whole, np.linalg.norm(value, axis=1), best).T, whole
-
-
-@pytest.mark.parametrize("devices", [PLAIN, BENT], ids=["plain", "lens and DOE"])
-def test_bounds_are_those_of_the_formulas_for_arrays(devices: tuple[Device, Device]) -> None:
-    rng = np.random.default_rng(8)
-    poses = POSES
-    points = np.column_stack([rng.uniform(-80, 80, (COUNT, 2)), rng.uniform(-10, 10, COUNT)])
-    normals = rng.normal(size=(COUNT, 3)) * 0.5 + [0, 0, 1]
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    seen = [world_pixels(device, T, points) for device, T in zip(devices, poses, strict=True)]
-    which = np.flatnonzero(seen[0][1])
-    uv = np.stack([pixels for pixels, _ in seen], 1)[which]
-    # The coordinates of the plane z = 0, a step across the image, noise, and holes.
-    h, w = devices[0].h, devices[0].w
-    v, u = np.mgrid[:h, :w] + 0.5
-    origin, d = pixel_rays(
-        Intrinsics.of(devices[0], torch.float64), torch.from_numpy(poses[0]), torch.from_numpy(np.stack([u, v], -1))
-    )
-    ground = (origin - origin[..., 2:] / d[..., 2:] * d).numpy().reshape(-1, 3)
-    coords = world_pixels(devices[1], poses[1], ground)[0].reshape(h, w, 2) + rng.normal(0, 0.3, (h, w, 2))
-    coords[:, 50:] += 25
-    coords[rng.random((h, w)) < 0.2] = np.nan
-    coords[:20, :20] = np.nan
-    mask = rng.random((h, w)) < 0.8
-    grown = mask | (rng.random((h, w)) < 0.5)
-    coords = coords.astype(np.float32)
-
-    offsets, outside = np.full((len(which), 2), np.nan), np.empty((len(which), 2), dtype=bool)
-    packed = np.stack([packed_device(device, T) for device, T in zip(devices, poses, strict=True)])
-    compare_decoded(len(which), points, normals, which, uv, coords, mask, grown, packed, MOST_PX, offsets, outside)
-    J = jacobian(points[which], normals[which], uv, devices, poses)
-    wanted, whole = bounds(coords, uv, J)
-    column, row = np.floor(uv[:, 0]).astype(int).T
-    assert np.array_equal(outside, np.stack([~grown[row, column], ~mask[row, column]], 1))
-    on = mask[row, column]
-    assert min((whole & on).sum(), (~whole & on).sum(), (on & np.isnan(wanted[:, 0])).sum()) > 40
-    assert (np.abs(J) == MOST_PX).any()
-    np.testing.assert_allclose(offsets[on], wanted[on], rtol=1e-7, atol=1e-7)
-    assert np.isnan(offsets[~on]).all()
-
-
 RADIUS = 40.0
 RING = pairs_around(6, elevation_deg=40)
-
-
-def ball(centre: tuple[float, float, float], radius: float, cell: float = 1.5) -> Mesh:
-    (x, y, z), r = centre, radius + 2 * cell
-    return extract_mesh(
-        lambda p: (p - p.new_tensor(centre)).norm(dim=-1) - radius,
-        round(2 * r / cell),
-        (x - r, y - r, z - r),
-        (x + r, y + r, z + r),
-    )
 
 
 def contains(mesh: Mesh, points: np.ndarray) -> np.ndarray:
@@ -291,11 +176,16 @@ def test_a_phantom_in_front_goes_and_what_it_hid_stays(truth, tmp_path):
     assert result.contradicted == pytest.approx((faces[0] & faces[1]).sum(), rel=0.1)
 
 
-def test_a_bulge_on_the_surface_goes(truth, ball_scan):
-    """Surface that is 8 mm too far out over a patch: every frame decodes something else there."""
-    towards = np.array([0.5, 0.0, np.sqrt(0.75)])
+def with_bulge(truth: Mesh, towards: np.ndarray, height: float, reach_deg: float) -> tuple[Mesh, np.ndarray]:
+    """The ball, too far out over a patch; and how many degrees each vertex is from the middle of the patch."""
     angle = np.degrees(np.arccos((truth.vertices / RADIUS @ towards).clip(-1, 1)))
-    bulged = Mesh(truth.vertices * (1 + 8 / RADIUS * np.clip((14 - angle) / 2, 0, 1))[:, None], truth.faces)
+    factor = 1 + height / RADIUS * np.clip((reach_deg - angle) / 2, 0, 1)
+    return Mesh(truth.vertices * factor[:, None], truth.faces), angle
+
+
+def test_a_bulge_on_the_surface_goes(truth, ball_scan):
+    """Every frame decodes something else there."""
+    bulged, angle = with_bulge(truth, np.array([0.5, 0.0, np.sqrt(0.75)]), 8.0, 14.0)
     result = trim_to_observed(bulged, ball_scan)
     kept = contains(result.mesh, bulged.vertices)
     assert not kept[angle < 10].any()
@@ -305,8 +195,7 @@ def test_a_bulge_on_the_surface_goes(truth, ball_scan):
 def test_one_frame_that_sees_through_an_invented_patch_outweighs_two_that_decode_nothing_there(truth, tmp_path):
     """A bulge over a patch that two of three frames do not decode, and one decodes where the object really is."""
     towards, poses = np.array([0.0, 0.0, 1.0]), RING[::2]
-    angle = np.degrees(np.arccos((truth.vertices / RADIUS @ towards).clip(-1, 1)))
-    bulged = Mesh(truth.vertices * (1 + 5 / RADIUS * np.clip((8 - angle) / 2, 0, 1))[:, None], truth.faces)
+    bulged, angle = with_bulge(truth, towards, 5.0, 8.0)
 
     def undecoded(number: int, coords: np.ndarray) -> np.ndarray:
         if number == 1:
@@ -321,10 +210,19 @@ def test_one_frame_that_sees_through_an_invented_patch_outweighs_two_that_decode
     assert kept[(angle > 15) & (angle < 40)].all()
 
 
-def cells(number: int, share: float, across: int = 16, size: int = 6) -> np.ndarray:
+def cells(number: int, share: float, size: int) -> np.ndarray:
     """A share of the cells of size x size camera pixels, another one in each frame."""
-    chosen = np.random.default_rng(number).random((across, across)) < share
-    return np.kron(chosen, np.ones((size, size), dtype=bool))
+    chosen = np.random.default_rng(number).random((192 // size, 192 // size)) < share
+    return np.kron(chosen, np.ones((size, size), dtype=bool))[..., None]
+
+
+def undecoded(share: float):
+    return lambda i, c: np.where(cells(i, share, 6), np.float32(np.nan), c)
+
+
+def wrong(i: int, c: np.ndarray) -> np.ndarray:
+    """3 % of the cells are off by 60 px."""
+    return c + np.float32(60) * cells(i, 0.03, 2)
 
 
 FINE = CAMERA.scaled(2.0)
@@ -338,35 +236,35 @@ def faces_observed(truth, tmp_path_factory) -> dict[int, int]:
     return {n: len(trim_to_observed(truth, scan).mesh.faces) for n, scan in scans.items()}
 
 
-@pytest.mark.parametrize("share", [0.15, 0.5])
-def test_undecoded_cells_inside_the_mask_make_no_hole(truth, faces_observed, tmp_path, share):
-    blank = np.float32(np.nan)
-    ball_scan = scan_of(
-        truth, RING, tmp_path / "scan", lambda i, c: np.where(cells(i, share, 32)[..., None], blank, c), FINE
-    )
-    holey = trim_to_observed(truth, ball_scan).mesh
-    assert euler(holey) == 1
-    assert len(holey.faces) == pytest.approx(faces_observed[len(RING)], rel=0.05)  # cells at the border are no gaps
-
-
-@pytest.mark.parametrize("frames", [1, 6])
-def test_wrongly_decoded_cells_make_no_hole(truth, faces_observed, tmp_path, frames):
-    """3 % wrong cells, off by 60 px; with one frame nothing else confirms the surface there."""
-    root, off = tmp_path / "scan", np.float32(60)
-    wrong = scan_of(truth, RING[:frames], root, lambda i, c: c + off * cells(i, 0.03, 96, 2)[..., None], FINE)
-    result = trim_to_observed(truth, wrong)
+@pytest.mark.parametrize(
+    ("frames", "change", "tolerance"),
+    [(6, undecoded(0.15), 0.05), (6, undecoded(0.5), 0.05), (6, wrong, 0.02), (1, wrong, 0.02)],
+    ids=["15 % undecoded", "half undecoded", "wrong", "wrong, and nothing else confirms the surface"],
+)
+def test_undecoded_and_wrong_cells_inside_the_mask_make_no_hole(
+    truth, faces_observed, tmp_path, frames, change, tolerance
+):
+    result = trim_to_observed(truth, scan_of(truth, RING[:frames], tmp_path / "scan", change, FINE))
     assert euler(result.mesh) == 1
-    assert len(result.mesh.faces) == pytest.approx(faces_observed[frames], rel=0.02)
+    assert len(result.mesh.faces) == pytest.approx(faces_observed[frames], rel=tolerance)  # cells at borders: no gaps
     assert frames > 1 or result.closed > 0
 
 
-def test_noise_of_coordinates_and_poses_cuts_nothing(truth, result, tmp_path):
+def test_noise_other_axes_and_missing_masks_cut_nothing(truth, ball_scan, result, tmp_path):
     rng = np.random.default_rng(0)
     noisy = scan_of(truth, RING, tmp_path / "scan", lambda i, c: c + rng.normal(0, 1, c.shape).astype(np.float32))
     tilt = exp_se3(torch.tensor([0.5, -0.5, 0.5, 0.003, 0.002, -0.003], dtype=torch.float64)).numpy()
-    moved = DevicePoses(noisy.poses.T_world_camera @ tilt, noisy.poses.T_world_projector)
-    faces = len(trim_to_observed(truth, noisy, moved).mesh.faces)
-    assert faces == pytest.approx(len(result.mesh.faces), rel=0.02)
+    tilted = DevicePoses(noisy.poses.T_world_camera @ tilt, noisy.poses.T_world_projector)
+    R = exp_so3(torch.tensor([0.3, -0.2, 0.9], dtype=torch.float64)).numpy()
+    S = Similarity(1.0, R, np.array([500.0, -20, 7]))
+    without = replace(ball_scan, frames=tuple(replace(f, mask_path=None) for f in ball_scan.frames))
+    for mesh, scan, poses, tolerance in (
+        (truth, noisy, tilted, 0.02),
+        (truth.mapped(S), ball_scan, ball_scan.poses.mapped(S), 2e-3),
+        (truth, without, None, 0),  # decoded pixels are the mask
+    ):
+        faces = len(trim_to_observed(mesh, scan, poses).mesh.faces)
+        assert faces == pytest.approx(len(result.mesh.faces), rel=tolerance)
 
 
 def test_shadows_and_hidden_parts_of_a_plane(tmp_path):
@@ -398,7 +296,7 @@ def box(bottom: float, top: float, half: float = 30.0) -> Mesh:
         q = (p - p.new_tensor(centre)).abs() - p.new_tensor(size)
         return q.clamp_min(0).norm(dim=-1) + q.max(-1).values.clamp_max(0)
 
-    return extract_mesh(sdf, 41, (-41.0, -41.0, -41.0), (41.0, 41.0, 41.0))
+    return extracted(sdf, 42, 41.0)
 
 
 def test_the_sides_of_a_thin_plate_do_not_grow_downwards(tmp_path):
@@ -444,26 +342,11 @@ def covered_pixels(T_camera: np.ndarray, points: np.ndarray) -> np.ndarray:
     return out
 
 
-def test_given_poses_replace_those_of_the_scan(truth, ball_scan, result):
-    R = exp_so3(torch.tensor([0.3, -0.2, 0.9], dtype=torch.float64)).numpy()
-    S = Similarity(1.0, R, np.array([500.0, -20, 7]))
-    moved = trim_to_observed(truth.mapped(S), ball_scan, ball_scan.poses.mapped(S)).mesh
-    assert len(moved.faces) == pytest.approx(len(result.mesh.faces), rel=2e-3)
-
-
-def test_wrong_poses_say_so(truth, ball_scan):
+def test_wrong_poses_and_another_surface_are_told_apart(truth, ball_scan):
     upside_down, given = np.diag([1.0, -1.0, -1.0, 1.0]), ball_scan.poses
     poses = DevicePoses(given.T_world_camera @ upside_down, given.T_world_projector @ upside_down)
     said = r"the frames observed no part(.|\n)*no vertex that faces camera and projector is inside a mask"
     with pytest.raises(UserError, match=rf"{said}(.|\n)*last step(.|\n)*sl-process(.|\n)*--keep-unobserved"):
         trim_to_observed(truth, ball_scan, poses)
-
-
-def test_another_surface_says_so(ball_scan):
     with pytest.raises(UserError, match=r"coordinates are not the decoded ones; they differ by \d+ px"):
         trim_to_observed(ball((0.0, 0.0, -70.0), 25.0), ball_scan)
-
-
-def test_missing_mask_files_mean_decoded_pixels(truth, ball_scan, result):
-    without = replace(ball_scan, frames=tuple(replace(f, mask_path=None) for f in ball_scan.frames))
-    assert len(trim_to_observed(truth, without).mesh.faces) == len(result.mesh.faces)

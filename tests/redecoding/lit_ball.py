@@ -4,14 +4,13 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import torch
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
 from sl_nerfstudio.pattern.grid import GridPattern
 from tests.formulas import look_at, on_ball, pixels, rays
+from tests.meshing.solids import extracted
 
 RADIUS = 40.0  # mm, about the origin
 CAMERA = Device(w=160, h=160, fl_x=460.0, fl_y=460.0, cx=80.0, cy=80.0)
@@ -36,7 +35,7 @@ def grid(seed: int = 0) -> ndarray:
 @cache
 def ball(cells: int = 90) -> Mesh:
     """The ball as a mesh."""
-    return extract_mesh(lambda p: p.norm(dim=-1) - RADIUS, cells, (-44.0,) * 3, (44.0,) * 3, device=torch.device("cpu"))
+    return extracted(lambda p: p.norm(dim=-1) - RADIUS, cells, 44.0)
 
 
 def seen_at(x: ndarray, y: ndarray) -> Lit:

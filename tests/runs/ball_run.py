@@ -10,10 +10,10 @@ import torch
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.runs.run import TrainedRun
 from sl_nerfstudio.scan import Scan
 from tests.meshing.ray_cast_scan import pairs_around, scan_of
+from tests.meshing.solids import ball
 
 CENTRE, RADIUS = np.array([3.0, -2.0, 5.0]), 40.0  # of the ball, mm
 S_SCENE_WORLD = Similarity(1 / 60, np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]), np.array([0.02, -0.03, 0.01]))
@@ -61,9 +61,7 @@ class BallModel:
 
 def ball_scan(root: Path) -> Scan:
     """Six captures of the ball from above."""
-    low, high = ((float(c[0]), float(c[1]), float(c[2])) for c in (CENTRE - 44, CENTRE + 44))
-    ball = extract_mesh(lambda p: (p - torch.from_numpy(CENTRE).float()).norm(dim=-1) - RADIUS, 60, low, high)
-    return scan_of(ball, pairs_around(6, 40), root)
+    return scan_of(ball(CENTRE.tolist(), RADIUS), pairs_around(6, 40), root)
 
 
 def run_of(scan: Scan, sigma: np.ndarray | None = None) -> TrainedRun:

@@ -125,16 +125,9 @@ def test_the_summary_says_what_was_removed_and_why(scan, found):
     assert "of the points left out: all cameras are in front of it, nothing is behind it" in text
 
 
-def test_a_surface_elsewhere_leaves_nothing(found):
-    far = Mesh(BALL.vertices + 500.0, BALL.faces)
+def test_nothing_left_and_no_coordinates_are_refused(found, tmp_path):
     with pytest.raises(UserError, match=r"leaves nothing of the surface\n.*far from the scan's decoded points"):
-        cut_object(far, found)
-
-
-def test_a_scan_without_coordinates_is_refused(tmp_path):
-    def nothing(_, coords):
-        return np.full_like(coords, np.nan)
-
-    empty = scan_of(MESH, pairs_around(2, 45), tmp_path / "scan", nothing)
+        cut_object(Mesh(BALL.vertices + 500.0, BALL.faces), found)
+    empty = scan_of(MESH, pairs_around(2, 45), tmp_path, lambda _, coords: np.full_like(coords, np.nan))
     with pytest.raises(UserError, match="no frame has decoded coordinates, so --object-only cannot find the object"):
         separate_scan(empty, empty.poses)

@@ -41,8 +41,6 @@ def test_what_a_training_writes_is_read(tmp_path, method):
     [
         ATTACK,
         TEXT.replace("prompt: null", f"prompt: {ATTACK}", 1),
-        TEXT.replace("seed: 42", f"seed: {ATTACK}", 1),
-        TEXT.replace("timestamp: ", f"timestamp: {ATTACK} #", 1),
         TEXT.replace("!!python/name:torch.optim.adam.Adam ''", "!!python/name:os.system ''", 1),
         TEXT.replace("!!python/name:torch.optim.adam.Adam ''", "!!python/module:antigravity", 1),
         TEXT.replace("accumulation_steps: {}", "accumulation_steps: !!python/object/new:os.system []", 1),
@@ -63,7 +61,6 @@ def test_code_is_not_run(tmp_path, text):
 FAULTS = {
     "no mapping": ("- 1\n- 2\n", "is not a training configuration"),
     "a word": ("words", "is not a training configuration"),
-    "plain mapping": ("a: 1\n", "is not a training configuration"),
     "no pipeline": (re.sub(r"\npipeline:.*?\n(?=\w)", "\n", TEXT, flags=re.S), "lacks the setting 'pipeline'"),
     "a setting of another version": (TEXT + "colour: red\n", "by an earlier version(.|\n)*has no setting 'colour'"),
     "text for a number": (TEXT.replace("seed: 42", "seed: many"), "'many' is no value for MachineConfig.seed"),
@@ -74,8 +71,6 @@ FAULTS = {
         "no value for SLModelConfig._target",
     ),
     "brackets": ("[" * 100_000, "nested too deeply"),
-    "braces": ("{a: " * 20_000, "nested too deeply"),
-    "dashes": ("- " * 50_000, "nested too deeply"),
     "indents": ("\n".join(" " * i + "a:" for i in range(1200)), "nested too deeply|cannot be read"),
     "a list in itself": ("&a [*a]", "is not a training configuration"),
     "many aliases": (
@@ -89,7 +84,6 @@ FAULTS = {
     "a long number": (TEXT.replace("seed: 42", f"seed: {'9' * 5000}"), "cannot be read|is no value"),
     "a large file": ("a: 1\n" * 300_000, r"it has 2 MB"),
     "not text": (b"\xff\xfe\x00", "cannot be read"),
-    "not closed": ("a: [", "cannot be read"),
     "impossible date": (TEXT.replace("timestamp: '{timestamp}'", "timestamp: 2001-99-99"), "cannot be read"),
 }
 

@@ -104,17 +104,14 @@ def _chart(found: BoardCalibration) -> str:
 def _thumbnail(picture: BoardPicture) -> str:
     """The photograph with the corners that were found."""
     grey = picture.grey / max(float(np.quantile(picture.grey, 0.99)), 1e-3)
-    factor = _THUMBNAIL / grey.shape[1]
-
-    def draw(axes: Axes) -> None:
-        axes.imshow(np.clip(grey, 0, 1), cmap="gray", vmin=0, vmax=1, extent=(0, grey.shape[1], grey.shape[0], 0))
-        if picture.corners is not None:
-            axes.plot(*picture.corners.uv.T, "+", color=charts.ORANGE, markersize=4, markeredgewidth=0.8)
-        axes.set_xlim(0, grey.shape[1])
-        axes.set_ylim(grey.shape[0], 0)
-        axes.axis("off")
-
-    return data_uri(_drawn(_THUMBNAIL, round(grey.shape[0] * factor), draw, 0.0))
+    figure, axes = _figure(_THUMBNAIL, round(grey.shape[0] * (_THUMBNAIL / grey.shape[1])), 0.0)
+    axes.imshow(np.clip(grey, 0, 1), cmap="gray", vmin=0, vmax=1, extent=(0, grey.shape[1], grey.shape[0], 0))
+    if picture.corners is not None:
+        axes.plot(*picture.corners.uv.T, "+", color=charts.ORANGE, markersize=4, markeredgewidth=0.8)
+    axes.set_xlim(0, grey.shape[1])
+    axes.set_ylim(grey.shape[0], 0)
+    axes.axis("off")
+    return data_uri(_drawn(figure))
 
 
 def _residual_field(
@@ -126,24 +123,25 @@ def _residual_field(
     usual = max(float(np.quantile(np.linalg.norm(r, axis=1), 0.95)), 1e-9)
     scale = _ARROW * device.w / usual
     low, high = np.minimum(uv.min(0), 0), np.maximum(uv.max(0), (device.w, device.h))
-
-    def draw(axes: Axes) -> None:
-        axes.quiver(*uv.T, *(r * scale).T, angles="xy", scale_units="xy", scale=1, width=0.0018, color=charts.BLUE)
-        axes.plot([device.cx], [device.cy], "x", color=charts.ORANGE, markersize=7)
-        axes.add_patch(Rectangle((0, 0), device.w, device.h, fill=False, color=charts.MUTED))
-        axes.set_aspect("equal")
-        axes.set_xlim(min(low[0], device.cx) - 0.02 * device.w, max(high[0], device.cx) + 0.02 * device.w)
-        axes.set_ylim(max(high[1], device.cy) + 0.02 * device.h, min(low[1], device.cy) - 0.02 * device.h)
-        axes.set_title(f"residuals, enlarged {scale:.0f} times; x: principal point", fontsize=8, color=charts.MUTED)
-        axes.tick_params(labelsize=7)
-
-    return data_uri(_drawn(640, 520, draw, 0.07), quality=90)
+    figure, axes = _figure(640, 520, 0.07)
+    axes.quiver(*uv.T, *(r * scale).T, angles="xy", scale_units="xy", scale=1, width=0.0018, color=charts.BLUE)
+    axes.plot([device.cx], [device.cy], "x", color=charts.ORANGE, markersize=7)
+    axes.add_patch(Rectangle((0, 0), device.w, device.h, fill=False, color=charts.MUTED))
+    axes.set_aspect("equal")
+    axes.set_xlim(min(low[0], device.cx) - 0.02 * device.w, max(high[0], device.cx) + 0.02 * device.w)
+    axes.set_ylim(max(high[1], device.cy) + 0.02 * device.h, min(low[1], device.cy) - 0.02 * device.h)
+    axes.set_title(f"residuals, enlarged {scale:.0f} times; x: principal point", fontsize=8, color=charts.MUTED)
+    axes.tick_params(labelsize=7)
+    return data_uri(_drawn(figure), quality=90)
 
 
-def _drawn(w: int, h: int, draw: Callable[[Axes], None], margin: float) -> Float[ndarray, "h w 3"]:
+def _figure(w: int, h: int, margin: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(w / 100, h / 100), dpi=100)
+    return figure, figure.add_axes((margin, margin, 1 - 1.3 * margin, 1 - 2 * margin))
+
+
+def _drawn(figure: Figure) -> Float[ndarray, "h w 3"]:
     canvas = FigureCanvasAgg(figure)
-    draw(figure.add_axes((margin, margin, 1 - 1.3 * margin, 1 - 2 * margin)))
     canvas.draw()
     return np.asarray(canvas.buffer_rgba(), np.float64)[..., :3] / 255
 

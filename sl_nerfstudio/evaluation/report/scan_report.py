@@ -256,10 +256,12 @@ def _main_figures(report: ReportInput) -> list[tuple[str, str, str]]:
 
 def _parts(report: ReportInput) -> tuple[dict[str, Any], list[Comparison], dict[str, Any] | None]:
     """What takes long, side by side. Matplotlib's settings belong to the process: one task draws with it at a time."""
-    surface = IndexedMesh(report.inputs.mesh)
-    compare = partial(compare_frames, surface, report.inputs.scan, report.evaluation.agreement, report.inputs.poses)
-    pictures_of, changes_of = partial(_surface_pictures, report, surface), partial(_pose_changes, report)
-    tasks: list[Callable[[], Any]] = [pictures_of, changes_of, compare]
+    surface, inputs = IndexedMesh(report.inputs.mesh), report.inputs
+    tasks: list[Callable[[], Any]] = [
+        partial(_surface_pictures, report, surface),
+        partial(_pose_changes, report),
+        partial(compare_frames, surface, inputs.scan, report.evaluation.agreement, inputs.poses),
+    ]
     (pictures, errors), changes, comparisons = results(tasks)
     if errors is not None:
         title, scale = "Signed distance of the surface from the reference", pictures["scale"]
