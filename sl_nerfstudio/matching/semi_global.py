@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Int32, UInt8
 from numpy import ndarray
 
+from sl_nerfstudio.decoding.decoder import Layer
 from sl_nerfstudio.matching.costs import OUTSIDE
 from sl_nerfstudio.matching.ranges import TILE, TriedRanges
 from sl_nerfstudio.parallel import compiled
@@ -29,7 +30,7 @@ _NEVER = np.int16(16000)  # more than any way costs
 class StereoMatches:
     """The best of the inverse distances that were tried, for every pixel."""
 
-    index: Float32[ndarray, "h w"]  # its number, with the fraction of a step that a parabola through the sums says;
+    index: Layer  # its number, with the fraction of a step that a parabola through the sums says;
     # NaN where none was tried
     cost: UInt8[ndarray, "h w"]  # its own, without changes
     margin: Float32[

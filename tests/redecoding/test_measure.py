@@ -98,7 +98,7 @@ def made_up(correlation: np.ndarray, margin: np.ndarray) -> Measured:
     n = len(correlation)
     zero = np.zeros(n, dtype=np.float32)
     return Measured(
-        places=np.zeros((n, 2), dtype=np.int64), coords=np.zeros((n, 2), dtype=np.float32), along=zero, across=zero,
+        places=np.zeros((n, 2), dtype=np.int64), coords=np.zeros((n, 2), dtype=np.float32), across=zero,
         correlation=correlation.astype(np.float32), margin=margin.astype(np.float32), roughness=zero,
         covered=zero + 1, step=zero, sigma=zero + 0.01,
     )  # fmt: skip
