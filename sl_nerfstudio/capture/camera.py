@@ -235,17 +235,14 @@ def draw_map(times_seen: Int[ndarray, "rows columns"]) -> UInt8[ndarray, "h w 3"
     return np.repeat(np.repeat(colours, cell, 0), cell, 1)
 
 
-def stack(pictures: Sequence[UInt8[ndarray, "_h _w 3"]]) -> UInt8[ndarray, "h w 3"]:
-    """Pictures below each other, as wide as the widest."""
-    width = max((picture.shape[1] for picture in pictures), default=0)
-    return np.concatenate([np.pad(picture, ((0, _GAP), (0, width - picture.shape[1]), (0, 0))) for picture in pictures])
-
-
 def compose(
     picture: UInt8[ndarray, "h w 3"], beside: Sequence[UInt8[ndarray, "_h _w 3"]], lines: Sequence[str]
 ) -> UInt8[ndarray, "H W 3"]:
     """The camera's image, smaller pictures beside it, and text below."""
-    parts = [picture, *([stack(beside)] if beside else [])]
+    parts = [picture]
+    if beside:  # below each other, as wide as the widest
+        widest = max(part.shape[1] for part in beside)
+        parts.append(np.concatenate([np.pad(p, ((0, _GAP), (0, widest - p.shape[1]), (0, 0))) for p in beside]))
     height = max(part.shape[0] for part in parts)
     width = sum(part.shape[1] for part in parts) + _GAP * (len(parts) - 1)
     out = np.full((height + _LINE * (len(lines) + 1), max(width, _LEAST_WIDTH), 3), 30, dtype=np.uint8)

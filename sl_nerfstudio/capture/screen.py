@@ -75,7 +75,33 @@ def display_size(number: int) -> tuple[int, int]:
     return sizes[number]
 
 
-class Screen:
+class _Keys:
+    """What keys are pressed in."""
+
+    _pygame: ModuleType
+
+    def key(self, seconds: float | None) -> Key | None:
+        """The next key that means something; None if there is none within `seconds` (None: wait for one)."""
+        meanings = {
+            Key.NEXT: (self._pygame.K_SPACE, self._pygame.K_RETURN, self._pygame.K_RIGHT, self._pygame.K_PAGEDOWN),
+            Key.BACK: (self._pygame.K_LEFT, self._pygame.K_PAGEUP),
+            Key.END: (self._pygame.K_ESCAPE, self._pygame.K_q),
+        }
+        end = None if seconds is None else time.monotonic() + seconds
+        while True:
+            left = _LONGEST_WAIT if end is None else min(_LONGEST_WAIT, end - time.monotonic())
+            event = self._pygame.event.wait(max(1, round(left * _MILLISECONDS)))
+            if event.type in (self._pygame.QUIT, self._pygame.WINDOWCLOSE):
+                return Key.END
+            if event.type == self._pygame.KEYDOWN:
+                for key, codes in meanings.items():
+                    if event.key in codes:
+                        return key
+            if event.type == self._pygame.NOEVENT and end is not None and time.monotonic() >= end:
+                return None
+
+
+class Screen(_Keys):
     """A display that is filled by one image at a time, pixel for pixel; black around smaller images."""
 
     def __init__(self, number: int) -> None:
@@ -102,10 +128,6 @@ class Screen:
         pixels[left : left + w, top : top + h] = image.T[..., None]
         del pixels  # it locks the surface
         self._pygame.display.flip()
-
-    def key(self, seconds: float | None) -> Key | None:
-        """The next key that means something; None if there is none within `seconds` (None: wait for one)."""
-        return next_key(self._pygame, seconds)
 
     def close(self) -> None:
         """Give the display back."""
@@ -136,28 +158,7 @@ def offset_on(display: tuple[int, int], size: tuple[int, int]) -> tuple[int, int
     return (display[0] - size[0]) // 2, (display[1] - size[1]) // 2
 
 
-def next_key(pygame: ModuleType, seconds: float | None) -> Key | None:
-    """The next key that means something; None if there is none within `seconds` (None: wait for one)."""
-    meanings = {
-        Key.NEXT: (pygame.K_SPACE, pygame.K_RETURN, pygame.K_RIGHT, pygame.K_PAGEDOWN),
-        Key.BACK: (pygame.K_LEFT, pygame.K_PAGEUP),
-        Key.END: (pygame.K_ESCAPE, pygame.K_q),
-    }
-    end = None if seconds is None else time.monotonic() + seconds
-    while True:
-        left = _LONGEST_WAIT if end is None else min(_LONGEST_WAIT, end - time.monotonic())
-        event = pygame.event.wait(max(1, round(left * _MILLISECONDS)))
-        if event.type in (pygame.QUIT, pygame.WINDOWCLOSE):
-            return Key.END
-        if event.type == pygame.KEYDOWN:
-            for key, codes in meanings.items():
-                if event.key in codes:
-                    return key
-        if event.type == pygame.NOEVENT and end is not None and time.monotonic() >= end:
-            return None
-
-
-class Window:
+class Window(_Keys):
     """A window for a picture in colour."""
 
     def __init__(self, title: str) -> None:
@@ -176,10 +177,6 @@ class Window:
         surface = self._window.get_surface()
         self._pygame.surfarray.blit_array(surface, picture.transpose(1, 0, 2))
         self._window.flip()
-
-    def key(self, seconds: float | None) -> Key | None:
-        """The next key that means something; None if there is none within `seconds`."""
-        return next_key(self._pygame, seconds)
 
     def close(self) -> None:
         """Close the window."""

@@ -17,6 +17,12 @@ from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.layout import PatternLayout
 from sl_nerfstudio.scan.images import Pixels
 
+Layer = Float32[ndarray, "h w"]
+"""A number for each pixel of an image."""
+Coords = Float32[ndarray, "h w 2"]
+"""The point (x, y) of the pattern that each pixel shows; NaN where unknown."""
+Mask = Bool[ndarray, "h w"]
+
 # The result of every decoder, and the error of a capture that cannot be decoded.
 
 
@@ -57,9 +63,7 @@ class DecodingError(UserError):
 # Connected regions of a coordinate image, and the tears between them: small regions are decoding errors.
 
 
-def drop_small_regions(
-    coords: Float32[ndarray, "h w 2"], largest_step: float, least_pixels: int
-) -> Float32[ndarray, "h w 2"]:
+def drop_small_regions(coords: Coords, largest_step: float, least_pixels: int) -> Coords:
     """Set connected regions of fewer than `least_pixels` pixels to NaN; `largest_step` as in `number_regions`."""
     number = number_regions(coords, largest_step)
     small = np.bincount(number.ravel(), minlength=1) < least_pixels
@@ -67,7 +71,7 @@ def drop_small_regions(
 
 
 def large_regions(
-    coords: Float32[ndarray, "h w 2"], largest_step: float, least_pixels: float
+    coords: Coords, largest_step: float, least_pixels: float
 ) -> Iterator[tuple[tuple[slice, slice], Bool[ndarray, "a b"]]]:
     """Regions of at least `least_pixels` pixels: the bounding box of each, and its pixels within the box."""
     number = number_regions(coords, largest_step)
@@ -77,14 +81,14 @@ def large_regions(
             yield box, number[box] == index
 
 
-def torn(coords: Float32[ndarray, "h w 2"], largest_step: float) -> Bool[ndarray, "h w"]:
+def torn(coords: Coords, largest_step: float) -> Mask:
     """Pixels on both sides of a step of either coordinate larger than `largest_step`; one to NaN is none."""
     out = np.zeros(coords.shape[:2], dtype=np.bool_)
     _mark_torn(coords, np.float32(largest_step), out)
     return out
 
 
-def number_regions(coords: Float32[ndarray, "h w 2"], largest_step: float) -> Int32[ndarray, "h w"]:
+def number_regions(coords: Coords, largest_step: float) -> Int32[ndarray, "h w"]:
     """Connected regions, numbered from 1 in the order of their first pixels; 0 where nothing is decoded.
 
     Neighbouring pixels (4 directions) are connected if both are decoded and neither coordinate differs by more than

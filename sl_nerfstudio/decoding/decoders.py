@@ -42,10 +42,7 @@ class GrayCodeDecoder(Decoder[GrayCode]):
         return replace(decoded, notes=(note, *decoded.notes))
 
 
-DECODERS: dict[str, type[Decoder[Any]]] = {
-    NetworkDecoder.name: NetworkDecoder,
-    GrayCodeDecoder.name: GrayCodeDecoder,
-}
+DECODERS: dict[str, type[Decoder[Any]]] = {NetworkDecoder.name: NetworkDecoder, GrayCodeDecoder.name: GrayCodeDecoder}
 """By name. The first one that reads a kind of pattern is the default for it."""
 
 

@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int8, Int16, Int32, Int64, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.decoder import Decoded, DecodingError, drop_small_regions
+from sl_nerfstudio.decoding.decoder import Coords, Decoded, DecodingError, Layer, Mask, drop_small_regions
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, solve_plane
 from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.gray_code import GrayCode, gray, ungray
-from sl_nerfstudio.pattern.layout import ShownImage
+from sl_nerfstudio.pattern.layout import HEAD, ShownImage
 from sl_nerfstudio.scan.images import as_grey
 
 # Coordinates finer than the cells of a Gray code.
@@ -43,7 +43,7 @@ class CodeCells:
     size: int  # of a cell, in cells of the pattern
 
 
-def subcell_coordinates(cells: CodeCells) -> Float32[ndarray, "h w"]:
+def subcell_coordinates(cells: CodeCells) -> Layer:
     """Coordinate of every pixel in cells; NaN where it is unknown.
 
     The cell of number 0 extends from 0 to 1. Where stripes are out of focus, the borders of coarser bits are used.
@@ -173,16 +173,15 @@ def _mean_cell(cell, level, y, x, half, reach):
 # The photographs of one sequence by what they show, as intensities in [0, 1].
 
 Image = UInt8[ndarray, "h w *c"] | UInt16[ndarray, "h w *c"]
-Grey = Float32[ndarray, "h w"]
 
 
 @dataclass(frozen=True)
 class Sine:
     """Phase, amplitude and mean of a shifted sine at every pixel."""
 
-    phase: Float32[ndarray, "h w"]  # radians, 0 to 2 pi
-    amplitude: Float32[ndarray, "h w"]  # of full scale; half of the direct light
-    mean: Float32[ndarray, "h w"]
+    phase: Layer  # radians, 0 to 2 pi
+    amplitude: Layer  # of full scale; half of the direct light
+    mean: Layer
 
 
 @dataclass(frozen=True)
@@ -192,21 +191,20 @@ class Photographs:
     images: Sequence[Image]
     layout: GrayCode
 
-    def grey(self, place: int) -> Grey:
+    def grey(self, place: int) -> Layer:
         """One image."""
         return as_grey(self.images[place])
 
-    def shown(self, what: ShownImage) -> Grey | None:
-        """The image that shows this; None if the sequence has none."""
-        place = self.layout.place(what)
-        return None if place is None else self.grey(place)
+    def white_and_black(self) -> Sequence[Layer]:
+        """Both images that every sequence of bits has."""
+        return [self.grey(self.layout.shown.index(item)) for item in HEAD]
 
-    def pair(self, place: int, inverse: int | None) -> tuple[Grey, Grey]:
+    def pair(self, place: int, inverse: int | None) -> tuple[Layer, Layer]:
         """An image and its inverse; white + black - image is the inverse where none was photographed."""
         direct = self.grey(place)
         if inverse is not None:
             return direct, self.grey(inverse)
-        white, black = (self.grey(self.layout.shown.index(ShownImage(what))) for what in ("white", "black"))
+        white, black = self.white_and_black()
         return direct, white + black - direct
 
     def sine(self, axis: int, steps: int, period: float) -> Sine:
@@ -239,7 +237,7 @@ class Photographs:
         That difference is smooth: it holds nothing of the object's texture, and global light varies slowly.
         """
         image = self.grey(place)
-        white, black = (self.grey(self.layout.shown.index(ShownImage(what))) for what in ("white", "black"))
+        white, black = self.white_and_black()
         rest = np.where(np.abs(image - white) < np.abs(image - black), image - white, image - black)
         around = (rest[:-2, 1:-1] + rest[2:, 1:-1] + rest[1:-1, :-2] + rest[1:-1, 2:]) / 4
         scale = np.sqrt(2 * (1 + 1 / 4))
@@ -301,7 +299,7 @@ _PIXEL_CENTRE = 0.5  # the sine is at its crest where the first pixel's centre i
 _LEAST_AMPLITUDE = 4.0  # times its own noise
 
 
-def cell_places(cells: CodeCells) -> Float32[ndarray, "h w"]:
+def cell_places(cells: CodeCells) -> Layer:
     """Roughly where in its cell each pixel lies, in cells; NaN unless all of its bits are certain or at a border.
 
     In the middle of a cell both bits that change at its borders are certain. Near a border that border's bit is
@@ -313,9 +311,7 @@ def cell_places(cells: CodeCells) -> Float32[ndarray, "h w"]:
     return np.where(cells.level == 0, place, np.nan).astype(np.float32)
 
 
-def phase_coordinates(
-    photographs: Photographs, axis: int, coarse: Float32[ndarray, "h w"] | None, noise: float
-) -> Float32[ndarray, "h w"]:
+def phase_coordinates(photographs: Photographs, axis: int, coarse: Layer | None, noise: float) -> Layer:
     """Coordinate of every pixel in pattern pixels from all sines of an axis, the longest first; NaN where unknown.
 
     `coarse` is the coordinate from the Gray code; None if the sequence has none, and then the longest sine has no
@@ -333,7 +329,7 @@ def phase_coordinates(
     return found.astype(np.float32)
 
 
-def _border_bit(cells: CodeCells, first: Int32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
+def _border_bit(cells: CodeCells, first: Int32[ndarray, "h w"]) -> Layer:
     """Certainty of the bit that changes between cell `first` and the next one; the largest value past the last."""
     bits = len(cells.difference)
     flipped = gray(np.maximum(first, 0)) ^ gray(np.maximum(first, 0) + 1)
@@ -364,11 +360,11 @@ _LEAST_REGION = 60  # pixels
 class SequenceLight:
     """Direct and global light of every pixel, of full scale."""
 
-    direct: Float32[ndarray, "h w"]
-    ambient: Float32[ndarray, "h w"]  # global light: from the whole scene, not from the pixel's own ray
-    signal: Float32[ndarray, "h w"]  # mean difference of the images from their inverse
+    direct: Layer
+    ambient: Layer  # global light: from the whole scene, not from the pixel's own ray
+    signal: Layer  # mean difference of the images from their inverse
     noise: float  # standard deviation of an image
-    brightest: Float32[ndarray, "h w"]  # in any of the finest images
+    brightest: Layer  # in any of the finest images
 
     @property
     def saturated(self) -> float:
@@ -376,7 +372,7 @@ class SequenceLight:
         return float((self.brightest[self.lit] > SATURATED).mean())
 
     @property
-    def lit(self) -> Bool[ndarray, "h w"]:
+    def lit(self) -> Mask:
         """Pixels that the projector reaches."""
         return self.signal > max(_LEAST_DIRECT, _LEAST_SIGNAL * self.noise)
 
@@ -384,16 +380,17 @@ class SequenceLight:
 def decode_gray_code(images: Sequence[Image], layout: GrayCode) -> Decoded:
     """Coordinates of every pixel from the photographs of one sequence, in the order of `layout`.
 
-    Grey or RGB, 8 or 16 bit, all of one size. Coordinates are finer than a cell: they use the places where
+    Layer or RGB, 8 or 16 bit, all of one size. Coordinates are finer than a cell: they use the places where
     the difference of an image and its inverse changes sign, and sines where there are any. Raises DecodingError if the
     sequence is incomplete, if its images have several sizes, or if nothing can be decoded.
     """
-    _check_sequence(images, layout)
+    check_count(len(images), layout)
+    check_sizes(images)
     photographs = Photographs(images, layout)
     light = separate(photographs)
     _check_light(images, layout, light)
     coords = np.full((*light.lit.shape, 2), np.nan, dtype=np.float32)
-    stripes: list[Float32[ndarray, "h w"]] = []
+    stripes: list[Layer] = []
     finest: list[int] = []
     for axis in (0, 1):
         cells = _read_cells(photographs, axis, light) if layout.bit_images(axis) else None
@@ -435,8 +432,8 @@ def separate(photographs: Photographs) -> SequenceLight:
             signal, count = signal + 2 * sine.amplitude, count + 1
             highest = np.maximum(highest, sine.mean + sine.amplitude)
             lowest = np.minimum(lowest, sine.mean - sine.amplitude)
-    black = photographs.shown(ShownImage("black"))
-    ambient = 2 * np.clip(lowest - (0 if black is None else black), 0, None)
+    place = layout.place(ShownImage("black"))
+    ambient = 2 * np.clip(lowest - (0 if place is None else photographs.grey(place)), 0, None)
     return SequenceLight(highest - lowest, ambient, signal / np.float32(count), photographs.noise(), highest)
 
 
@@ -456,9 +453,7 @@ def _notes(layout: GrayCode, light: SequenceLight, finest: Sequence[int]) -> Ite
         )
 
 
-def _coordinates(
-    photographs: Photographs, axis: int, light: SequenceLight, cells: CodeCells | None
-) -> Float32[ndarray, "h w"]:
+def _coordinates(photographs: Photographs, axis: int, light: SequenceLight, cells: CodeCells | None) -> Layer:
     """Coordinates of all pixels along an axis, in pattern pixels."""
     layout = photographs.layout
     first, count = layout.first_code(axis), (layout.columns, layout.rows)[axis]
@@ -472,7 +467,7 @@ def _coordinates(
     return np.where((found >= 0) & (found <= size), found, np.float32(np.nan))
 
 
-def _usual_step(coords: Float32[ndarray, "h w 2"]) -> float:
+def _usual_step(coords: Coords) -> float:
     """Median difference of neighbouring pixels, in pattern pixels: a camera far coarser than the projector."""
     steps = [np.abs(np.diff(coords, axis=axis)).max(-1) for axis in (0, 1)]
     known = np.concatenate([step[np.isfinite(step)] for step in steps])
@@ -488,11 +483,6 @@ def check_count(count: int, layout: GrayCode) -> None:
             f"({layout.w} x {layout.h} pixels in cells of {layout.cell})",
             f"give one image of each of the {layout.images} patterns, or the pattern file that they were made with",
         )
-
-
-def _check_sequence(images: Sequence[Image], layout: GrayCode) -> None:
-    check_count(len(images), layout)
-    check_sizes(images)
 
 
 def _check_light(images: Sequence[Image], layout: GrayCode, light: SequenceLight) -> None:
@@ -540,7 +530,7 @@ def _read_cells(photographs: Photographs, axis: int, light: SequenceLight) -> Co
     return CodeCells(cell, level, differences[:bits], size)
 
 
-def _uncertain(p: Float32[ndarray, "h w"], q: Float32[ndarray, "h w"], light: SequenceLight) -> Bool[ndarray, "h w"]:
+def _uncertain(p: Layer, q: Layer, light: SequenceLight) -> Mask:
     """Find pixels where image `p` and its inverse `q` do not decide a bit.
 
     Their difference is plus or minus the direct light, plus a share of the global light between -1 and 1. Its sign is
@@ -551,7 +541,7 @@ def _uncertain(p: Float32[ndarray, "h w"], q: Float32[ndarray, "h w"], light: Se
     return (difference <= light.ambient - light.direct) | (difference < np.maximum(_UNCERTAIN * light.direct, noise))
 
 
-def _stripe_image(photographs: Photographs, axis: int, light: SequenceLight) -> Float32[ndarray, "h w"]:
+def _stripe_image(photographs: Photographs, axis: int, light: SequenceLight) -> Layer:
     """The finest stripes of an axis in [0, 1], with albedo and shading removed."""
     layout, direct = photographs.layout, np.maximum(light.direct, _LEAST_DIRECT)
     places = layout.bit_images(axis)

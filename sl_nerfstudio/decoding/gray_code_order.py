@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter
 
-from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.decoder import DecodingError, Mask
 from sl_nerfstudio.decoding.gray_code import OVEREXPOSED, SATURATED, Image, Samples, check_sizes, take_samples
 from sl_nerfstudio.pattern.gray_code import GrayCode, ungray
 from sl_nerfstudio.pattern.layout import HEAD, ORDERS, SequenceName, order_names
@@ -37,7 +37,6 @@ _INSIDE = 0.99  # of the certain samples: codes of cells of the pattern
 _TURNING = 0.9  # of the samples: axes that turn as the camera's
 
 Grid = Float32[ndarray, "n h w"]
-Lit = Bool[ndarray, "h w"]
 Values = Int64[ndarray, "h w"] | Float64[ndarray, "h w"]
 
 
@@ -77,7 +76,7 @@ def check_order(samples: Samples, layout: GrayCode) -> OrderCheck:
     if lit.sum() < _LEAST_LIT:
         return OrderCheck((), None, False)
     misplaced = _heads(grid, layout, lit) + _not_inverse(grid, layout, lit) + _no_sines(grid, layout, lit)
-    codes: list[tuple[Values, Lit]] = []
+    codes: list[tuple[Values, Mask]] = []
     for axis in (0, 1):
         if layout.bit_images(axis):
             misplaced += _not_continued(samples, layout, axis)
@@ -165,7 +164,7 @@ def _in_pattern(grid: Grid, layout: GrayCode) -> float:
     return min(shares, default=1.0)
 
 
-def _heads(grid: Grid, layout: GrayCode, lit: Lit) -> list[Misplaced]:
+def _heads(grid: Grid, layout: GrayCode, lit: Mask) -> list[Misplaced]:
     highest, lowest = grid.max(0), grid.min(0)
     slack = _NEAR * (highest - lowest)
     found = []
@@ -179,7 +178,7 @@ def _heads(grid: Grid, layout: GrayCode, lit: Lit) -> list[Misplaced]:
     return found
 
 
-def _not_inverse(grid: Grid, layout: GrayCode, lit: Lit) -> list[Misplaced]:
+def _not_inverse(grid: Grid, layout: GrayCode, lit: Mask) -> list[Misplaced]:
     """Images and their inverses that do not add up to the brightest and the darkest."""
     highest, lowest = grid.max(0), grid.min(0)
     found = []
@@ -194,7 +193,7 @@ def _not_inverse(grid: Grid, layout: GrayCode, lit: Lit) -> list[Misplaced]:
     return found
 
 
-def _no_sines(grid: Grid, layout: GrayCode, lit: Lit) -> list[Misplaced]:
+def _no_sines(grid: Grid, layout: GrayCode, lit: Mask) -> list[Misplaced]:
     """Sines whose mean is not that of white and black or of the other sines, or whose shifts do not make a sine."""
     sines = [(axis, *sine) for axis in (0, 1) for sine in layout.sines(axis)]
     places = [layout.sine_images(*sine) for sine in sines]
@@ -245,7 +244,7 @@ def _index(signs: Sequence[Bool[ndarray, "*at"]]) -> Int64[ndarray, "*at"]:
     return ungray(code, len(signs))
 
 
-def _turning(x: tuple[Values, Lit], y: tuple[Values, Lit]) -> float | None:
+def _turning(x: tuple[Values, Mask], y: tuple[Values, Mask]) -> float | None:
     """Share of samples at which the gradients of both cells turn from x to y as the camera's axes do."""
     known = x[1] & y[1]
     weight = gaussian_filter(known.astype(np.float64), _ORDER_SMOOTHING)
@@ -278,10 +277,7 @@ _ONE_DIRECTION = DecodingError(
 
 
 def layout_of_images(
-    images: Sequence[Image],
-    size: tuple[int, int],
-    name: SequenceName | None = None,
-    cell: int | None = None,
+    images: Sequence[Image], size: tuple[int, int], name: SequenceName | None = None, cell: int | None = None
 ) -> GrayCode:
     """The sequence that these photographs of one frame show, for a projector of `size` (w, h).
 

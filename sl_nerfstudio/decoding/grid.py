@@ -8,10 +8,10 @@ from typing import ClassVar
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8, UInt16
+from jaxtyping import Float32, UInt8, UInt16
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.decoder import Decoded, Decoder, drop_small_regions, torn
+from sl_nerfstudio.decoding.decoder import Coords, Decoded, Decoder, Layer, Mask, drop_small_regions, torn
 from sl_nerfstudio.decoding.grid_detection import LEAST_NODES, DetectedGrid, GridDetector, refusal
 from sl_nerfstudio.decoding.grid_edges import Chosen, EdgeChooser, EdgeEvidence, weight_files
 from sl_nerfstudio.decoding.grid_fit import DrawnGrid, draw_sharpnesses, fit_densely
@@ -59,12 +59,12 @@ _LOOKED_AT = 1200  # pixels of the longer side at which the grid is looked for f
 class FirstLook:
     """An image whose grid was found and read, before edges are looked at."""
 
-    grey: Float32[ndarray, "h w"]
+    grey: Layer
     found: DetectedGrid
     evidence: EdgeEvidence
 
     @property
-    def mask(self) -> Bool[ndarray, "h w"]:
+    def mask(self) -> Mask:
         """Where the pattern lights the object."""
         return self.evidence.probability > LEAST_MASK
 
@@ -99,7 +99,7 @@ class GridImageDecoder:
         coords = self._select(chosen, found.appearance.period)
         return self.decoded(first.grey, coords, first.mask, found.appearance.period)
 
-    def clear_coords(self, first: FirstLook) -> Float32[ndarray, "h w 2"]:
+    def clear_coords(self, first: FirstLook) -> Coords:
         """Coordinates that are right without a look at edges: fewer than all, and enough to know where a frame is."""
         evidence, period = first.evidence, first.found.appearance.period
         fitted = evidence.fitted
@@ -110,19 +110,15 @@ class GridImageDecoder:
         kept = first.mask & right & ~beside & self._inside(fitted)
         return np.where(kept[..., None], fitted, np.float32(np.nan))
 
-    def decoded(
-        self,
-        grey: Float32[ndarray, "h w"],
-        coords: Float32[ndarray, "h w 2"],
-        mask: Bool[ndarray, "h w"],
-        pixels_a_period: float,
-    ) -> Decoded:
+    def decoded(self, grey: Layer, coords: Coords, mask: Mask, pixels_a_period: float) -> Decoded:
         """All maps of a capture with these coordinates; the mask holds every pixel that has any."""
         mask = mask | np.isfinite(coords[..., 0])
         light = projected_light(grey, coords, self._soft, _LIGHT_WINDOW * pixels_a_period)
-        return Decoded(coords, mask, self._normalise(grey, mask, pixels_a_period), light)
+        picture = self.drawn[0].layers[..., 0]
+        sigma, mean, contrast = _NORMALISING * pixels_a_period, float(picture.mean()), float(picture.std())
+        return Decoded(coords, mask, normalise_locally(grey, mask, sigma, mean, contrast), light)
 
-    def detect(self, grey: Float32[ndarray, "h w"]) -> DetectedGrid:
+    def detect(self, grey: Layer) -> DetectedGrid:
         """The grid in an image. Raises DecodingError if too little of it fits the pattern."""
         found = self._detector.detect(grey)
         if found is None or found.known < LEAST_NODES:
@@ -146,7 +142,7 @@ class GridImageDecoder:
             factor //= 2
         return None
 
-    def examine(self, grey: Float32[ndarray, "h w"], found: DetectedGrid) -> EdgeEvidence:
+    def examine(self, grey: Layer, found: DetectedGrid) -> EdgeEvidence:
         """Coordinates of all pixels that a node reaches, and what tells the right ones from the wrong ones."""
         assignment, known = found.assignment, found.assignment.known
         phases = sample_pixels(found.maps, found.rectified, (grey.shape[0], grey.shape[1]))
@@ -162,14 +158,14 @@ class GridImageDecoder:
         fitted, agreement = fit_densely(grey, read, trust, self.drawn, found.appearance.period)
         return EdgeEvidence(read, fitted, agreement, log_ratio, phases.probability)
 
-    def _select(self, chosen: Chosen, pixels_a_period: float) -> Float32[ndarray, "h w 2"]:
+    def _select(self, chosen: Chosen, pixels_a_period: float) -> Coords:
         """The coordinates without pixels that are probably wrong and without small regions."""
         kept = (chosen.wrong < _MOST_WRONG) & self._inside(chosen.coords)
         coords = np.where(kept[..., None], chosen.coords, np.float32(np.nan))
         least = round(_SMALLEST_REGION * pixels_a_period**2)
         return drop_small_regions(coords, _TEAR * self.pattern.period, least)
 
-    def _inside(self, coords: Float32[ndarray, "h w 2"]) -> Bool[ndarray, "h w"]:
+    def _inside(self, coords: Coords) -> Mask:
         """Pixels whose coordinates lie in the pattern; False for NaN."""
         x, y = coords[..., 0], coords[..., 1]
         return (x >= 0) & (x <= self.pattern.w) & (y >= 0) & (y <= self.pattern.h)
@@ -184,21 +180,11 @@ class GridImageDecoder:
         """Continues coordinates beside edges."""
         return EdgeChooser(self._networks.edges, self.pattern, self.drawn)
 
-    def _normalise(
-        self, grey: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"], pixels_a_period: float
-    ) -> Float32[ndarray, "h w"]:
-        mean, spread = float(self._picture.mean()), float(self._picture.std())
-        return normalise_locally(grey, mask, _NORMALISING * pixels_a_period, mean, spread)
-
     @cached_property
     def _soft(self) -> list[Float32[ndarray, "ph pw"]]:
         """The pattern through lenses of different sharpness."""
         picture, period = self.pattern.render(), self.pattern.period
         return [cv2.GaussianBlur(picture, (0, 0), blur * period) for blur in _LIGHT_BLURS]
-
-    @property
-    def _picture(self) -> Float32[ndarray, "ph pw"]:
-        return self.drawn[0].layers[..., 0]
 
 
 class NetworkDecoder(Decoder[GridPattern]):

@@ -1,4 +1,4 @@
-"""The error of a capture that cannot be decoded, with the causes that its measurements show."""
+"""Where in an image the grid is; and the error where it is not, with the causes that measurements show."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -7,11 +7,11 @@ from functools import lru_cache
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int32
+from jaxtyping import Float, Float32, Int32
 from numpy import ndarray
 from torch import Tensor
 
-from sl_nerfstudio.decoding.decoder import DecodingError
+from sl_nerfstudio.decoding.decoder import DecodingError, Layer, Mask
 from sl_nerfstudio.decoding.grid_edges import load_graph_network
 from sl_nerfstudio.decoding.grid_graph import (
     DOWN,
@@ -61,15 +61,13 @@ class NodeRecogniser:
     def __init__(self, pattern: GridPattern) -> None:
         self.codes = np.asarray(pattern.codes)
         self._network = load_graph_network()
-        self._turned = turned_pattern(self.codes)
-        with torch.inference_mode():
-            around = torch.from_numpy(self._turned.around.astype(np.int64))
-            self._features = self._network(one_hot(self._turned.symbol), around)
-            self._candidates = [self._features[torch.from_numpy(self._turned.turn == turn)] for turn in range(4)]
+        turned = turned_pattern(self.codes)
+        features = self._features_of(one_hot(turned.symbol), turned.around)
+        self._candidates = [features[torch.from_numpy(turned.turn == turn)] for turn in range(4)]
 
     def assign(self, graph: GridGraph) -> Assignment:
         """The place in the pattern of every node of a graph."""
-        features = self._features_of(graph)
+        features = self._features_of(torch.from_numpy(graph.score), neighbourhoods(graph.neighbour))
         best, total = self._best_by_turn(features)
         turn = choose_turn(best)
         codes = rotate_codes(self.codes, turn)
@@ -79,17 +77,9 @@ class NodeRecogniser:
             place[index] = believe(own.reshape(-1, *codes.shape), graph.part(index).neighbour)
         return Assignment(turn, agree(place, graph, codes))
 
-    def logits(self, graph: GridGraph) -> Float[Tensor, "n m"]:
-        """Similarity of each node to each node of the pattern in its four quarter turns.
-
-        Candidates are in the order of `turned_pattern`.
-        """
-        return self._logits(self._features_of(graph), self._features)
-
-    def _features_of(self, graph: GridGraph) -> Float[Tensor, "n features"]:
-        around = torch.from_numpy(neighbourhoods(graph.neighbour).astype(np.int64))
+    def _features_of(self, score: Float[Tensor, "n 5"], around: Int32[ndarray, "n 25"]) -> Float[Tensor, "n features"]:
         with torch.inference_mode():
-            return self._network(torch.from_numpy(graph.score), around)
+            return self._network(score, torch.from_numpy(around.astype(np.int64)))
 
     def _logits(self, features: Float[Tensor, "k features"], candidates: Float[Tensor, "m features"]) -> Tensor:
         with torch.inference_mode():
@@ -155,9 +145,9 @@ class GridDetector:
 
     def __init__(self, pattern: GridPattern, unet: Maps) -> None:
         self._unet = unet
-        self._recogniser = NodeRecogniser(pattern)
+        self.recogniser = NodeRecogniser(pattern)
 
-    def detect(self, grey: Float32[ndarray, "h w"]) -> DetectedGrid | None:
+    def detect(self, grey: Layer) -> DetectedGrid | None:
         """The reading in which most nodes have a place, after trying the most probable appearances of the grid.
 
         Textures show crossings, too, but hardly any of them fits the pattern. None for an image without contrast.
@@ -171,11 +161,7 @@ class GridDetector:
                 break
         return best
 
-    def assign(self, graph: GridGraph) -> Assignment:
-        """The places of a graph's nodes in the pattern."""
-        return self._recogniser.assign(graph)
-
-    def _read(self, grey: Float32[ndarray, "h w"], appearance: GridAppearance) -> DetectedGrid:
+    def _read(self, grey: Layer, appearance: GridAppearance) -> DetectedGrid:
         """Rectify by a guess and read; once more if what fits the pattern shows that the guess was far off."""
         found = self._read_once(grey, appearance)
         known = found.assignment.known
@@ -187,11 +173,11 @@ class GridDetector:
         again = self._read_once(grey, GridAppearance(period, measured.roll))
         return again if (again.known, again.nodes) > (found.known, found.nodes) else found
 
-    def _read_once(self, grey: Float32[ndarray, "h w"], appearance: GridAppearance) -> DetectedGrid:
+    def _read_once(self, grey: Layer, appearance: GridAppearance) -> DetectedGrid:
         rectified = rectify(grey, appearance)
         maps = predict_maps(rectified, self._unet)
         graph = without_fragments(build_graph(maps), LEAST_PIECE)
-        return DetectedGrid(appearance, rectified, maps, graph, self.assign(graph))
+        return DetectedGrid(appearance, rectified, maps, graph, self.recogniser.assign(graph))
 
 
 def _far_off(measured: GridAppearance, guess: GridAppearance) -> bool:
@@ -260,7 +246,7 @@ class Exposure:
     noise: float  # standard deviation of its noise
 
 
-def measure_exposure(grey: Float32[ndarray, "h w"]) -> Exposure:
+def measure_exposure(grey: Layer) -> Exposure:
     """Exposure of an image in [0, 1].
 
     The noise is measured with a mask that is blind to planes and edges (Immerkaer, 1996), by the median.
@@ -276,7 +262,7 @@ def measure_exposure(grey: Float32[ndarray, "h w"]) -> Exposure:
     )
 
 
-def measure_noise(grey: Float32[ndarray, "h w"]) -> float:
+def measure_noise(grey: Layer) -> float:
     """Standard deviation of the noise of an image in [0, 1]; at least that of rounding to 8 bits."""
     residual = np.abs(cv2.filter2D(grey, -1, _LAPLACIAN)) / 6
     return max(float(np.median(residual)) / _NORMAL_MEDIAN, float(_ROUNDING))
@@ -294,7 +280,7 @@ _LEAST_FIRST = 0.1  # of the local contrast, sum of both families: with less the
 _FEWEST = 100  # places of the maps
 
 
-def edge_width(grey: Float32[ndarray, "h w"]) -> float:
+def edge_width(grey: Layer) -> float:
     """Sigma, in pixels, of the blur of the strongest edges; infinite without edges.
 
     A second blur of known width lowers the gradient of an edge the less, the wider the edge already is (Zhuo and Sim,
@@ -312,14 +298,12 @@ def edge_width(grey: Float32[ndarray, "h w"]) -> float:
     return float(np.sqrt(max(_AGAIN**2 / (ratio**2 - 1) - _SMOOTHING**2 - _DIFFERENCE, 0.0)))
 
 
-def _slope(image: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
+def _slope(image: Layer) -> Layer:
     gy, gx = np.gradient(image)
     return np.hypot(gx, gy)
 
 
-def line_blur(
-    rectified: RectifiedImage, maps: PhaseMaps, where: Bool[ndarray, "h w"], pattern: GridPattern
-) -> float | None:
+def line_blur(rectified: RectifiedImage, maps: PhaseMaps, where: Mask, pattern: GridPattern) -> float | None:
     """Sigma, in periods, of the blur of a grid's lines at some places of the maps; None if they show no lines.
 
     The profile across the lines is compared with that of the drawn pattern at many blurs.
@@ -384,9 +368,7 @@ class Cause:
     remedy: str
 
 
-def refusal(
-    grey: Float32[ndarray, "h w"], found: DetectedGrid | None, detector: GridDetector, pattern: GridPattern
-) -> DecodingError:
+def refusal(grey: Layer, found: DetectedGrid | None, detector: GridDetector, pattern: GridPattern) -> DecodingError:
     """The error for a capture in which too few crossings have a place in the pattern."""
     if float(np.ptp(grey)) < _BLANK:
         return DecodingError(
@@ -396,21 +378,14 @@ def refusal(
         )
     nodes, known = (found.nodes, found.known) if found is not None else (0, 0)
     causes = _causes(grey, found, detector, pattern)
-    problem = (
-        f"shows no grid of lines ({nodes} crossings were found, {LEAST_NODES} are needed)"
-        if nodes < LEAST_NODES
-        else f"shows {nodes} crossings of lines, but only {known} of them fit the pattern"
-    )
-    return DecodingError(
-        problem,
-        "; ".join(cause.words for cause in causes),
-        "; ".join(dict.fromkeys(cause.remedy for cause in causes)),
-    )
+    problem = f"shows {nodes} crossings of lines, but only {known} of them fit the pattern"
+    if nodes < LEAST_NODES:
+        problem = f"shows no grid of lines ({nodes} crossings were found, {LEAST_NODES} are needed)"
+    remedies = dict.fromkeys(cause.remedy for cause in causes)
+    return DecodingError(problem, "; ".join(cause.words for cause in causes), "; ".join(remedies))
 
 
-def _causes(
-    grey: Float32[ndarray, "h w"], found: DetectedGrid | None, detector: GridDetector, pattern: GridPattern
-) -> list[Cause]:
+def _causes(grey: Layer, found: DetectedGrid | None, detector: GridDetector, pattern: GridPattern) -> list[Cause]:
     """Every cause that a measurement shows; if there is none, that the pattern was looked for and is not there."""
     exposure = measure_exposure(grey)
     saturated = exposure.saturated > _MOST_SATURATED
@@ -431,13 +406,13 @@ def _weakness(exposure: Exposure) -> list[Cause]:
     if exposure.contrast >= _LEAST_CONTRAST * exposure.noise:
         return []
     facts = f"details of {255 * exposure.contrast:.1f} grey levels in noise of {255 * exposure.noise:.1f}"
-    words = f"it is too dark: {facts}" if exposure.bright < _DARK else f"the pattern is too weak: {facts}"
-    return [Cause(words, "capture again with more light of the projector, or a longer exposure")]
+    what = "it is too dark" if exposure.bright < _DARK else "the pattern is too weak"
+    return [Cause(f"{what}: {facts}", "capture again with more light of the projector, or a longer exposure")]
 
 
 def _misfit(found: DetectedGrid, detector: GridDetector) -> list[Cause]:
     """A grid that was read, and is not that of the pattern as it is."""
-    if detector.assign(mirrored(found.graph)).known.sum() >= LEAST_NODES:
+    if detector.recogniser.assign(mirrored(found.graph)).known.sum() >= LEAST_NODES:
         words = "the image is mirrored: its mirror image fits the pattern"
         return [Cause(words, "switch the projector from rear to front projection, or the camera's mirroring off")]
     if shows_readable_symbols(found.graph):
@@ -446,29 +421,24 @@ def _misfit(found: DetectedGrid, detector: GridDetector) -> list[Cause]:
     return []
 
 
-def _blur(grey: Float32[ndarray, "h w"], found: DetectedGrid | None, pattern: GridPattern) -> list[Cause]:
+def _blur(grey: Layer, found: DetectedGrid | None, pattern: GridPattern) -> list[Cause]:
     """Check for blur: of the lines if there is a grid, else of the sharpest edges."""
-    remedy = "capture again in focus and with nothing moving"
     if found is None or not shows_grid(found.graph):
-        width = edge_width(grey)
-        facts = f"its sharpest edges have a sigma of {width:.1f} pixels"
-        return [Cause(f"it is blurred: {facts}", remedy)] if width > _WIDEST_EDGE else []
-    blur = line_blur(found.rectified, found.maps, clear_places(found.maps), pattern)
-    facts = f"the lines have a sigma of {blur:.2f} periods" if blur is not None else ""
-    return [Cause(f"it is blurred: {facts}", remedy)] if blur is not None and blur > _MOST_BLUR else []
+        sigma, most, words = edge_width(grey), _WIDEST_EDGE, "its sharpest edges have a sigma of {:.1f} pixels"
+    else:
+        sigma = line_blur(found.rectified, found.maps, clear_places(found.maps), pattern)
+        most, words = _MOST_BLUR, "the lines have a sigma of {:.2f} periods"
+    if sigma is None or sigma <= most:
+        return []
+    return [Cause(f"it is blurred: {words.format(sigma)}", "capture again in focus and with nothing moving")]
 
 
 def _not_there(found: DetectedGrid | None) -> Cause:
-    remedy = "point the camera at what the projector lights, with the pattern brighter than other light and a period "
-    remedy += "at least 8 pixels wide"
     if found is None or found.nodes < LEAST_NODES:
-        return Cause(
-            "the pattern is out of view: the image is neither dark, saturated nor blurred, and no part of it shows a "
-            "grid",
-            remedy,
-        )
-    return Cause(
-        "not known: the image is neither dark, saturated, blurred nor mirrored, and its symbols cannot be read; the "
-        "crossings may belong to a texture",
-        remedy,
-    )
+        words = "the pattern is out of view: the image is neither dark, saturated nor blurred, and no part of it shows "
+        words += "a grid"
+    else:
+        words = "not known: the image is neither dark, saturated, blurred nor mirrored, and its symbols cannot be "
+        words += "read; the crossings may belong to a texture"
+    remedy = "point the camera at what the projector lights, with the pattern brighter than other light and a period "
+    return Cause(words, remedy + "at least 8 pixels wide")

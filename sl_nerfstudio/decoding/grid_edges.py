@@ -2,18 +2,18 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Float64, Int
+from jaxtyping import Float, Float32, Int
 from numpy import ndarray
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from sl_nerfstudio.decoding.decoder import torn
+from sl_nerfstudio.decoding.decoder import Coords, Layer, torn
 from sl_nerfstudio.decoding.grid_fit import DrawnGrid
 from sl_nerfstudio.decoding.grid_graph import GraphNetwork
 from sl_nerfstudio.decoding.grid_phases import (
@@ -37,11 +37,11 @@ from sl_nerfstudio.pattern.grid import GridPattern, gaussian_window
 class EdgeEvidence:
     """Coordinates and what tells the right ones from the wrong ones; NaN or anything where not decoded."""
 
-    read: Float32[ndarray, "h w 2"]  # coordinates that the network read, pattern pixels
-    fitted: Float32[ndarray, "h w 2"]  # the same, fitted to the image
-    agreement: Float32[ndarray, "h w"]  # correlation of image and drawn pattern
-    log_ratio: Float32[ndarray, "h w"]  # mean log-likelihood ratio of the symbols
-    probability: Float32[ndarray, "h w"]  # that the pattern is there
+    read: Coords  # coordinates that the network read, pattern pixels
+    fitted: Coords  # the same, fitted to the image
+    agreement: Layer  # correlation of image and drawn pattern
+    log_ratio: Layer  # mean log-likelihood ratio of the symbols
+    probability: Layer  # that the pattern is there
 
 
 # Coordinates continued as a plane from a place some pixels away.
@@ -64,7 +64,7 @@ def steps(distances: tuple[int, ...] = _DISTANCES) -> Int[ndarray, "k 2"]:
     return np.rint(np.concatenate([[(0.0, 0.0)], *[r * around for r in distances]])).astype(np.int64)
 
 
-def slopes(coords: Float32[ndarray, "h w 2"], period: float, scale: float = 1.0) -> Float32[ndarray, "h w 2 2"]:
+def slopes(coords: Coords, period: float, scale: float = 1.0) -> Float32[ndarray, "h w 2 2"]:
     """Derivatives of coordinates (x, y) by pixels (x, y), means over a small window; NaN where there are none.
 
     `period` is in the unit of the coordinates; `scale` is the size of a pixel of the rectified image in pixels of this
@@ -110,11 +110,7 @@ def _divide(total: ndarray, count: ndarray) -> None:
                     total[row, column, axis, by] = total[row, column, axis, by] / n if n > _LEAST_SEEN else np.nan
 
 
-def continued(
-    coords: Float32[ndarray, "h w 2"],
-    slope: Float32[ndarray, "h w 2 2"],
-    step: Int[ndarray, "h w 2"],
-) -> Float32[ndarray, "h w 2"]:
+def continued(coords: Coords, slope: Float32[ndarray, "h w 2 2"], step: Int[ndarray, "h w 2"]) -> Coords:
     """Coordinates at each pixel on the plane at the place `step` pixels (x, y) away; NaN where nothing is known there.
 
     A pixel whose step is zero keeps its coordinates.
@@ -158,8 +154,8 @@ class EdgeView:
     """The evidence of a capture in its rectified image; coordinates in periods, NaN where unknown."""
 
     measured: Float[ndarray, "7 h w"]  # contrast, brightness, pattern sharp and soft, agreement, ratio, probability
-    fitted: Float32[ndarray, "h w 2"]
-    read: Float32[ndarray, "h w 2"]
+    fitted: Coords
+    read: Coords
     continued: Float[ndarray, "8 h w"]  # the pattern as it is drawn where surfaces around are continued
 
     def part(self, rows: slice, columns: slice) -> "EdgeView":
@@ -203,13 +199,8 @@ def edge_view(
 
 
 def _drawn_if_continued(
-    fitted: Float32[ndarray, "h w 2"],
-    slope: Float32[ndarray, "h w 2 2"],
-    step: ndarray,
-    drawn: DrawnGrid,
-    grid: GridPattern,
-    turn: int,
-) -> Float32[ndarray, "h w"]:
+    fitted: Coords, slope: Float32[ndarray, "h w 2 2"], step: ndarray, drawn: DrawnGrid, grid: GridPattern, turn: int
+) -> Layer:
     """The pattern where every pixel is continued from the place one step away; 0 where nothing is known there."""
     coords = continued(fitted, slope, np.broadcast_to(step, fitted.shape))
     return np.where(np.isfinite(coords[..., 0]), drawn.at(to_pattern(coords, grid, turn))[..., 0], np.float32(0))
@@ -220,9 +211,7 @@ def _moved(layer: Float32[ndarray, "h w *k"], rectified: RectifiedImage, flags: 
     return cv2.warpAffine(layer, integer_centres(rectified.from_image), size, flags=flags)
 
 
-def moved_coords(
-    coords: Float32[ndarray, "h w 2"], rectified: RectifiedImage, tear: float = _TORN_PHASE
-) -> Float32[ndarray, "a b 2"]:
+def moved_coords(coords: Coords, rectified: RectifiedImage, tear: float = _TORN_PHASE) -> Float32[ndarray, "a b 2"]:
     """Coordinates in the rectified image; NaN where unknown.
 
     Bilinear where the four pixels around differ by less than `tear`, else those of the nearest pixel.
@@ -284,8 +273,8 @@ _STRIP = 512  # rows of the rectified image that the network is given at a time,
 class Chosen:
     """Coordinates of every pixel that a surface can be continued to, in pattern pixels, and whether they hold."""
 
-    coords: Float32[ndarray, "h w 2"]
-    wrong: Float32[ndarray, "h w"]  # probability that they are more than a tenth of a period off
+    coords: Coords
+    wrong: Layer  # probability that they are more than a tenth of a period off
 
 
 class EdgeChooser:
@@ -308,14 +297,14 @@ class EdgeChooser:
         nearest = np.asarray(cv2.warpAffine(step, affine, shape, flags=cv2.INTER_NEAREST | back), dtype=np.int64)
         border = (_SURELY_WRONG,) * 4
         odds = cv2.warpAffine(wrong, affine, shape, flags=cv2.INTER_LINEAR | back, borderValue=border)
-        own = self._own_steps(linear)
+        own = np.rint(np.linalg.solve(linear, self._steps.T).T).astype(np.int64)  # in pixels of the capture
         scale = float(np.sqrt(abs(np.linalg.det(linear)))) ** -1
         slope = slopes(evidence.fitted, self._grid.period, scale)
         coords = continued(evidence.fitted, slope, own[nearest])
         odds[np.isnan(coords[..., 0])] = _SURELY_WRONG
         return Chosen(coords, (1 / (1 + np.exp(-odds))).astype(np.float32))
 
-    def _predict(self, view: EdgeView) -> tuple[Int[ndarray, "h w"], Float32[ndarray, "h w"]]:
+    def _predict(self, view: EdgeView) -> tuple[Int[ndarray, "h w"], Layer]:
         """Index of the chosen step, and log odds of being wrong, for every pixel of the rectified image."""
         known = np.isfinite(view.fitted[..., 0])
         channels, rows = view.channels(), len(known)
@@ -326,10 +315,6 @@ class EdgeChooser:
             here = self._network(strip)[(first - begin) // STRIDE :]
             _choose(here, known, self._steps, first, last, step, wrong)
         return step, wrong
-
-    def _own_steps(self, linear: Float64[ndarray, "2 2"]) -> Int[ndarray, "k 2"]:
-        """The steps in pixels of the capture."""
-        return np.rint(np.linalg.solve(linear, self._steps.T).T).astype(np.int64)
 
 
 @compiled
@@ -356,33 +341,29 @@ def _choose(
 
 
 _WEIGHTS = Path(__file__).parent / "weights"
+N = TypeVar("N", bound=nn.Module)
 
 
 def load_unet() -> UNet:
     """The trained U-Net, in evaluation mode."""
-    network = UNet()
-    network.load_state_dict(_weights("unet"))
-    return network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return _trained(UNet(), "unet").to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 
 def load_graph_network() -> GraphNetwork:
     """The trained graph network, in evaluation mode."""
-    network = GraphNetwork()
-    network.load_state_dict(_weights("gcn"))
-    return network.eval()
+    return _trained(GraphNetwork(), "gcn")
 
 
 def load_edge_network() -> EdgeNetwork:
     """The trained edge network, in evaluation mode."""
-    network = EdgeNetwork()
-    network.load_state_dict(_weights("edges"))
-    return network.eval().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    return _trained(EdgeNetwork(), "edges").to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+
+
+def _trained(network: N, name: str) -> N:
+    network.load_state_dict(load_file(_WEIGHTS / f"{name}.safetensors"))
+    return network.eval()
 
 
 def weight_files() -> list[Path]:
     """All files of weights, sorted by name."""
     return sorted(_WEIGHTS.glob("*.safetensors"))
-
-
-def _weights(name: str) -> dict[str, torch.Tensor]:
-    return load_file(_WEIGHTS / f"{name}.safetensors")

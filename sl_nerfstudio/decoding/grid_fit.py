@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 from numpy import ndarray
 
-from sl_nerfstudio.decoding.decoder import large_regions
+from sl_nerfstudio.decoding.decoder import Coords, Layer, Mask, large_regions
 from sl_nerfstudio.parallel import compiled, parallel, results
 
 # Gaussian means and local planes for images with unknown parts.
@@ -39,9 +39,7 @@ def gaussian_means(layers: Float32[ndarray, "k h w 4"], sigma: float) -> Float32
     return out
 
 
-def local_planes(
-    coords: Float32[ndarray, "h w 2"], weights: Float32[ndarray, "h w"], sigma: float
-) -> Float32[ndarray, "h w 2"]:
+def local_planes(coords: Coords, weights: Layer, sigma: float) -> Coords:
     """The value at each pixel of the plane that fits the values around it, in a Gaussian window, best.
 
     Values of weight zero may be NaN.
@@ -58,12 +56,12 @@ def local_planes(
 
 
 def flattened(
-    values: Float32[ndarray, "h w 2"],
-    inside: Bool[ndarray, "h w"],
-    weights: Float32[ndarray, "h w"],
+    values: Coords,
+    inside: Mask,
+    weights: Layer,
     windows: Sequence[tuple[float, float]],
-    is_near: Callable[[Float32[ndarray, "h w 2"], float], Bool[ndarray, "h w"]],
-) -> Float32[ndarray, "h w 2"]:
+    is_near: Callable[[Coords, float], Mask],
+) -> Coords:
     """Each pixel on the plane through the largest window that is near its own value, or else as it is.
 
     `windows` are standard deviations, in pixels and largest first, each with the limit that `is_near` gets beside the
@@ -138,13 +136,13 @@ class DrawnGrid:
     layers: Float32[ndarray, "h w 3"]
     period: float
 
-    def at(self, coords: Float32[ndarray, "h w 2"]) -> Float32[ndarray, "h w 3"]:
+    def at(self, coords: Coords) -> Float32[ndarray, "h w 3"]:
         """Bilinear values at pattern pixels."""
         place = np.nan_to_num(coords) - np.float32(0.5)
         return cv2.remap(self.layers, place[..., 0], place[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
 
 
-def draw_sharpnesses(picture: Float32[ndarray, "h w"], period: float) -> tuple[DrawnGrid, ...]:
+def draw_sharpnesses(picture: Layer, period: float) -> tuple[DrawnGrid, ...]:
     """The pattern as it appears through lenses of different sharpness."""
     drawn = []
     for blur in _BLURS:
@@ -162,8 +160,8 @@ class GridLight:
     side.
     """
 
-    contrast: Float32[ndarray, "h w"]
-    brightness: Float32[ndarray, "h w"]
+    contrast: Layer
+    brightness: Layer
 
     @staticmethod
     def even(shape: tuple[int, ...]) -> "GridLight":
@@ -197,19 +195,13 @@ _LEAST_AGREEMENT, _LEAST_SEEN = 0.05, 0.05  # with which the variance of a shift
 class ShiftFit(NamedTuple):
     """Shift that moves the drawn pattern onto the image at each pixel."""
 
-    shift: Float32[ndarray, "h w 2"]  # of the coordinates, periods
-    agreement: Float32[ndarray, "h w"]  # correlation of image and pattern
-    variance: Float32[ndarray, "h w"]  # of the shift along either axis if pixels err independently, periods squared
+    shift: Coords  # of the coordinates, periods
+    agreement: Layer  # correlation of image and pattern
+    variance: Layer  # of the shift along either axis if pixels err independently, periods squared
 
 
 def fit_shift(
-    image: Float32[ndarray, "h w"],
-    coords: Float32[ndarray, "h w 2"],
-    trust: Float32[ndarray, "h w"],
-    grid: DrawnGrid,
-    light: GridLight,
-    pixels_a_period: float,
-    window: float,
+    image: Layer, coords: Coords, trust: Layer, grid: DrawnGrid, light: GridLight, pixels_a_period: float, window: float
 ) -> ShiftFit:
     """The fit in a Gaussian window about each pixel, whose standard deviation is `window` periods."""
     step = _square_size(pixels_a_period)
@@ -221,19 +213,20 @@ def fit_shift(
     return ShiftFit(fit[..., :2], fit[..., 2], fit[..., 3])
 
 
-def measure_light(
-    image: Float32[ndarray, "h w"],
-    coords: Float32[ndarray, "h w 2"],
-    trust: Float32[ndarray, "h w"],
-    grid: DrawnGrid,
-    pixels_a_period: float,
-) -> GridLight:
-    """The light in the image, from coordinates that are nearly right."""
+def measure_light(image: Layer, coords: Coords, trust: Layer, grid: DrawnGrid, pixels_a_period: float) -> GridLight:
+    """The light in the image by least squares, from coordinates that are nearly right.
+
+    The contrast is at least a quarter of that of well lit parts.
+    """
     step = _square_size(pixels_a_period)
-    m = _moments(image, grid.at(coords), trust, step)
-    means = gaussian_means(m[:2], _LIGHT_WINDOW * pixels_a_period / step)
-    contrast, brightness = _contrast_and_brightness(means)
-    light = enlarge(np.dstack([contrast, brightness]), image.shape, step)
+    m = gaussian_means(_moments(image, grid.at(coords), trust, step)[:2], _LIGHT_WINDOW * pixels_a_period / step)
+    n = np.maximum(m[0, ..., 0], 1e-6)
+    mp, pp, mi, ip = m[0, ..., 1] / n, m[0, ..., 2] / n, m[0, ..., 3] / n, m[1, ..., 0] / n
+    contrast = (ip - mi * mp) / np.maximum(pp - mp * mp, 1e-6)
+    seen = contrast[m[0, ..., 0] > 0.5]
+    floor = _LEAST_CONTRAST * float(np.quantile(seen, _WELL_LIT)) if len(seen) else 0.0
+    contrast = np.maximum(contrast, max(floor, 1e-3))
+    light = enlarge(np.dstack([contrast, mi - contrast * mp]), image.shape, step)
     return GridLight(light[..., 0], light[..., 1])
 
 
@@ -242,9 +235,7 @@ def _square_size(pixels_a_period: float) -> int:
     return max(1, round(pixels_a_period / _SQUARES))
 
 
-def _moments(
-    image: Float32[ndarray, "h w"], drawn: Float32[ndarray, "h w 3"], trust: Float32[ndarray, "h w"], step: int
-) -> Float32[ndarray, "4 a b 4"]:
+def _moments(image: Layer, drawn: Float32[ndarray, "h w 3"], trust: Layer, step: int) -> Float32[ndarray, "4 a b 4"]:
     """Products of the pattern p, its derivatives px and py and the image i, averaged over squares of `step` pixels.
 
     In groups of four: (1, p, pp, i), (ip, ii, px, py), (p px, p py, px px, px py), (py py, i px, i py, 0).
@@ -273,20 +264,6 @@ def _add_products(image: ndarray, drawn: ndarray, trust: ndarray, step: int, out
             for group in range(4):
                 for k in range(4):
                     out[group, r, c, k] += weight * products[group][k]
-
-
-def _contrast_and_brightness(
-    m: Float32[ndarray, "2 h w 4"],
-) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
-    """Fit contrast and brightness by least squares; the contrast is at least a quarter of that of well lit parts."""
-    n = np.maximum(m[0, ..., 0], 1e-6)
-    mp, pp, mi, ip = m[0, ..., 1] / n, m[0, ..., 2] / n, m[0, ..., 3] / n, m[1, ..., 0] / n
-    variance = np.maximum(pp - mp * mp, 1e-6)
-    contrast = (ip - mi * mp) / variance
-    seen = contrast[m[0, ..., 0] > 0.5]
-    floor = _LEAST_CONTRAST * float(np.quantile(seen, _WELL_LIT)) if len(seen) else 0.0
-    contrast = np.maximum(contrast, max(floor, 1e-3))
-    return contrast, mi - contrast * mp
 
 
 @compiled
@@ -335,12 +312,8 @@ _LARGEST_SHIFT = 0.12  # periods, of all rounds together
 
 
 def fit_densely(
-    image: Float32[ndarray, "h w"],
-    coords: Float32[ndarray, "h w 2"],
-    trust: Float32[ndarray, "h w"],
-    grids: tuple[DrawnGrid, ...],
-    pixels_a_period: float,
-) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
+    image: Layer, coords: Coords, trust: Layer, grids: tuple[DrawnGrid, ...], pixels_a_period: float
+) -> tuple[Coords, Layer]:
     """Refined coordinates in pattern pixels, and the correlation of pattern and image there (-1 to 1).
 
     `trust` is the weight of each pixel, from 0 to 1: in a shadow the image must not pull at the pattern.
@@ -356,19 +329,12 @@ def fit_densely(
 
 
 def _refine(
-    image: Float32[ndarray, "h w"],
-    coords: Float32[ndarray, "h w 2"],
-    trust: Float32[ndarray, "h w"],
-    inside: Bool[ndarray, "h w"],
-    grids: tuple[DrawnGrid, ...],
-    pixels_a_period: float,
-) -> tuple[Float32[ndarray, "h w 2"], Float32[ndarray, "h w"]]:
+    image: Layer, coords: Coords, trust: Layer, inside: Mask, grids: tuple[DrawnGrid, ...], pixels_a_period: float
+) -> tuple[Coords, Layer]:
     """A few rounds of fitting shifts, with the sharpness that agrees best with the image.
 
     Outside `inside`, values continue the nearest planes.
     """
-    if not inside.any():
-        return np.full_like(coords, np.nan), np.zeros_like(image)
     period = grids[0].period
     coords = _smooth(coords, inside, pixels_a_period, period)
     start, even = coords, GridLight.even(image.shape)
@@ -386,12 +352,10 @@ def _refine(
     return coords, fit_shift(image, coords, trust, grids[best], even, pixels_a_period, _WINDOW).agreement
 
 
-def _smooth(
-    coords: Float32[ndarray, "h w 2"], inside: Bool[ndarray, "h w"], pixels_a_period: float, period: float
-) -> Float32[ndarray, "h w 2"]:
+def _smooth(coords: Coords, inside: Mask, pixels_a_period: float, period: float) -> Coords:
     """Smooth coordinates on planes that are near each pixel's own coordinates."""
 
-    def is_near(apart: Float32[ndarray, "h w 2"], limit: float) -> Bool[ndarray, "h w"]:
+    def is_near(apart: Coords, limit: float) -> Mask:
         return apart[..., 0] ** 2 + apart[..., 1] ** 2 < (limit * period) ** 2
 
     windows = [(window * pixels_a_period, limit) for window, limit in _SMOOTHING]

@@ -14,9 +14,10 @@ from jaxtyping import Bool, Float, Float32, Float64, Int8, Int32, Int64
 from numpy import ndarray
 from scipy.ndimage import maximum_filter, uniform_filter1d
 from scipy.spatial import KDTree
-from scipy.special import log_softmax
+from scipy.special import log_softmax, softmax
 from torch import Tensor, nn
 
+from sl_nerfstudio.decoding.decoder import Coords, Layer
 from sl_nerfstudio.geometry.numerics import component_labels
 from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.codes import SYMBOLS, rotate_codes
@@ -39,12 +40,12 @@ def symbol_log_likelihood(score: Float32[ndarray, "n 5"]) -> Float32[ndarray, "n
 
 
 def symbol_log_ratio(
-    coords: Float32[ndarray, "h w 2"],
+    coords: Coords,
     codes: Int8[ndarray, "rows columns"],
     symbol: Float32[ndarray, "5 a b"],
     to_map: Float64[ndarray, "2 3"],
     pixels_a_period: float,
-) -> Float32[ndarray, "h w"]:
+) -> Layer:
     """Mean log-likelihood ratio, around each pixel, of its coordinates against random symbols; 0 where none was read.
 
     `coords` are in periods within the array `codes`, `symbol` are the network's logits, and `to_map` maps pixels
@@ -102,7 +103,7 @@ _INTERRUPTED = 9.0  # periods: stands for a phase that cannot be followed
 class PhaseMaps:
     """Mask, phases and symbols of a rectified image at places one unit apart; phases in periods, 0 at the nodes."""
 
-    mask: Float32[ndarray, "h w"]  # probability
+    mask: Layer  # probability
     vector: Float32[ndarray, "4 h w"]  # cosine and sine in x, then in y
     symbol: Float32[ndarray, "5 h w"]  # logits
     gradient: Float32[ndarray, "2 2 h w"]  # of the phases in x and y, along x and y; periods per unit
@@ -123,9 +124,7 @@ class GridGraph:
         return GridGraph(self.place[index], number[self.neighbour[index]], self.score[index])
 
 
-def phase_maps(
-    mask: Float32[ndarray, "h w"], vector: Float32[ndarray, "4 h w"], symbol: Float32[ndarray, "5 h w"]
-) -> PhaseMaps:
+def phase_maps(mask: Layer, vector: Float32[ndarray, "4 h w"], symbol: Float32[ndarray, "5 h w"]) -> PhaseMaps:
     """The network's output with the gradients of the phases, smoothed over 3 x 3 places."""
     gradient = np.empty((2, 2, *mask.shape), dtype=np.float32)
     for axis in range(2):
@@ -257,8 +256,7 @@ def _symbol_scores(maps: PhaseMaps, place: Float32[ndarray, "n 2"]) -> Float32[n
     column = np.clip(np.rint(place[:, 0]).astype(int), 0, w - 1)
     row = np.clip(np.rint(place[:, 1]).astype(int), 0, h - 1)
     at_node = logits[:, row, column].T
-    power = np.exp(at_node - at_node.max(-1, keepdims=True))
-    return (power / power.sum(-1, keepdims=True)).astype(np.float32)
+    return softmax(at_node, axis=-1).astype(np.float32)
 
 
 def neighbourhoods(neighbour: Int32[ndarray, "n 4"]) -> Int32[ndarray, "n 25"]:

@@ -13,6 +13,7 @@ from numpy import ndarray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from sl_nerfstudio.decoding.decoder import Coords, Layer, Mask
 from sl_nerfstudio.decoding.grid_graph import GridGraph, PhaseMaps, phase_maps
 from sl_nerfstudio.parallel import DeviceName, compiled
 from sl_nerfstudio.pattern.codes import SYMBOLS
@@ -27,7 +28,7 @@ _WINDOW = 0.8  # of the local statistics, in periods
 _FLOOR = 0.015  # of the full brightness: weaker contrast is treated as none
 
 
-def network_channels(image: Float32[ndarray, "h w"], full: float | None = None) -> Float32[ndarray, "2 h w"]:
+def network_channels(image: Layer, full: float | None = None) -> Float32[ndarray, "2 h w"]:
     """Local contrast and brightness of a rectified image whose intensities are at least 0.
 
     `full` is the intensity of brightly lit lines, by default the 99.5 % quantile of the image.
@@ -131,24 +132,16 @@ class ConvolutionPair(nn.Sequential):
 def to_pattern(turned: Float32[ndarray, "*n 2"], grid: GridPattern, turn: int) -> Float32[ndarray, "*n 2"]:
     """Pattern pixels of places (x, y), in periods, in the array of nodes after `turn` quarter turns."""
     x, y = turned[..., 0], turned[..., 1]
-    i, j = (
-        (y, x),
-        (grid.rows - 1 - x, y),
-        (grid.rows - 1 - y, grid.columns - 1 - x),
-        (x, grid.columns - 1 - y),
-    )[turn]
+    last_i, last_j = grid.rows - 1, grid.columns - 1
+    i, j = ((y, x), (last_i - x, y), (last_i - y, last_j - x), (x, last_j - y))[turn]
     return np.stack([grid.x0 + j * grid.period, grid.y0 + i * grid.period], -1).astype(np.float32)
 
 
 def from_pattern(coords: Float32[ndarray, "*n 2"], grid: GridPattern, turn: int) -> Float32[ndarray, "*n 2"]:
     """The inverse of `to_pattern`."""
     j, i = (coords[..., 0] - grid.x0) / grid.period, (coords[..., 1] - grid.y0) / grid.period
-    x, y = (
-        (j, i),
-        (grid.rows - 1 - i, j),
-        (grid.columns - 1 - j, grid.rows - 1 - i),
-        (i, grid.columns - 1 - j),
-    )[turn]
+    last_i, last_j = grid.rows - 1, grid.columns - 1
+    x, y = ((j, i), (last_i - i, j), (last_j - j, last_i - i), (i, last_j - j))[turn]
     return np.stack([x, y], -1).astype(np.float32)
 
 
@@ -161,12 +154,7 @@ _LARGEST_STEP = 0.3  # periods between two neighbouring pixels
 _FARTHEST = 2.0  # periods from the node
 
 
-def spread(
-    phase: Float32[ndarray, "h w 2"],
-    seen: Bool[ndarray, "h w"],
-    pixel: Int32[ndarray, "n 2"],
-    place: Int32[ndarray, "n 2"],
-) -> Float32[ndarray, "h w 2"]:
+def spread(phase: Coords, seen: Mask, pixel: Int32[ndarray, "n 2"], place: Int32[ndarray, "n 2"]) -> Coords:
     """Coordinates (x, y) in periods; NaN where no node reaches.
 
     `phase` is from -0.5 to 0.5 periods; `pixel` (row, column) shows the node at `place` (row, column) of the pattern.
@@ -178,13 +166,7 @@ def spread(
 
 @compiled
 def _spread(
-    phase: ndarray,
-    seen: ndarray,
-    pixel: ndarray,
-    place: ndarray,
-    coords: ndarray,
-    largest_step: float,
-    farthest: float,
+    phase: ndarray, seen: ndarray, pixel: ndarray, place: ndarray, coords: ndarray, largest_step: float, farthest: float
 ) -> None:
     """Breadth first: every pixel is reached from the nearest node, counted in pixels."""
     h, w = seen.shape
@@ -249,11 +231,11 @@ class GridAppearance:
 class RectifiedImage:
     """An image turned and scaled; `from_image` maps pixels (x, y, 1) of the original to its own, centres at .5."""
 
-    image: Float32[ndarray, "h w"]
+    image: Layer
     from_image: Float64[ndarray, "2 3"]
 
 
-def guess_appearances(image: Float32[ndarray, "h w"], count: int = 3) -> list[GridAppearance]:
+def guess_appearances(image: Layer, count: int = 3) -> list[GridAppearance]:
     """The most probable appearances of the grid, best first; none for an image without contrast."""
     power = _local_power(image)
     if power is None:
@@ -277,7 +259,7 @@ def guess_appearances(image: Float32[ndarray, "h w"], count: int = 3) -> list[Gr
     return found
 
 
-def rectify(image: Float32[ndarray, "h w"], appearance: GridAppearance) -> RectifiedImage:
+def rectify(image: Layer, appearance: GridAppearance) -> RectifiedImage:
     """The image turned upright and scaled until a period measures `RECTIFIED_PERIOD` pixels."""
     h, w = image.shape
     c, s = np.cos(-appearance.roll), np.sin(-appearance.roll)
@@ -301,7 +283,7 @@ def integer_centres(affine: Float64[ndarray, "2 3"]) -> Float64[ndarray, "2 3"]:
     return out
 
 
-def _local_power(image: Float32[ndarray, "h w"]) -> Float32[ndarray, "t t"] | None:
+def _local_power(image: Layer) -> Float32[ndarray, "t t"] | None:
     """Mean power spectrum of overlapping tiles, each weighted by its contrast, not by its brightness."""
     h, w = image.shape
     padded = cv2.copyMakeBorder(image, 0, max(_TILE - h, 0), 0, max(_TILE - w, 0), cv2.BORDER_REFLECT_101)
@@ -349,14 +331,9 @@ _FEWEST = 12
 class PixelPhases:
     """Phases at the pixels of the capture."""
 
-    phase: Float32[ndarray, "h w 2"]  # periods, from -0.5 to 0.5
-    probability: Float32[ndarray, "h w"]  # that the pattern is there
-    clear: Bool[ndarray, "h w"]  # the pattern is there and its phases are known
-
-    @property
-    def mask(self) -> Bool[ndarray, "h w"]:
-        """Pixels that show the pattern."""
-        return self.probability > LEAST_MASK
+    phase: Coords  # periods, from -0.5 to 0.5
+    probability: Layer  # that the pattern is there
+    clear: Mask  # the pattern is there and its phases are known
 
 
 def predict_maps(rectified: RectifiedImage, network: Maps) -> PhaseMaps:
@@ -366,12 +343,12 @@ def predict_maps(rectified: RectifiedImage, network: Maps) -> PhaseMaps:
     return phase_maps(mask.numpy(), np.ascontiguousarray(output[1:5]), np.ascontiguousarray(output[5:]))
 
 
-def clear_places(maps: PhaseMaps) -> Bool[ndarray, "h w"]:
+def clear_places(maps: PhaseMaps) -> Mask:
     """Places of the maps at which the network is certain."""
     return (maps.mask > _CLEAR_MASK) & (np.hypot(maps.vector[0], maps.vector[1]) > _CLEAR_VECTOR)
 
 
-def node_places(maps: PhaseMaps, graph: GridGraph, chosen: Bool[ndarray, "n"]) -> Bool[ndarray, "h w"]:
+def node_places(maps: PhaseMaps, graph: GridGraph, chosen: Bool[ndarray, "n"]) -> Mask:
     """The places of the chosen nodes of a graph."""
     where = np.zeros(maps.mask.shape, dtype=bool)
     column, row = np.rint(graph.place[chosen]).astype(int).T
@@ -379,7 +356,7 @@ def node_places(maps: PhaseMaps, graph: GridGraph, chosen: Bool[ndarray, "n"]) -
     return where
 
 
-def measure_appearance(maps: PhaseMaps, guess: GridAppearance, where: Bool[ndarray, "h w"]) -> GridAppearance | None:
+def measure_appearance(maps: PhaseMaps, guess: GridAppearance, where: Mask) -> GridAppearance | None:
     """Period and roll of the grid in the capture by the phases at some places; `guess` is what it was rectified by.
 
     None where there are hardly any places.

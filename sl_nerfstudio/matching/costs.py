@@ -6,9 +6,10 @@ it, one inverse distance after the other: all that is needed on the way stays in
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8, UInt32
+from jaxtyping import Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 
+from sl_nerfstudio.decoding.decoder import Coords, Layer, Mask
 from sl_nerfstudio.decoding.grid_fit import DrawnGrid
 from sl_nerfstudio.matching.lines import EpipolarLines, places_on_lines
 from sl_nerfstudio.matching.ranges import TILE, TriedRanges
@@ -21,11 +22,11 @@ HALF = 127  # the cost where image and pattern have nothing to do with each othe
 OUTSIDE = 255  # the cost beside the pattern
 _WIDEST = 6  # tiles of a block
 
-Statistics = tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]
+Statistics = tuple[Layer, Layer]
 """Mean of the image in the window of each pixel, and its variance, with what is added to it."""
 
 
-def image_statistics(image: Float32[ndarray, "h w"], decoded: Bool[ndarray, "h w"], sigma: float) -> Statistics:
+def image_statistics(image: Layer, decoded: Mask, sigma: float) -> Statistics:
     """Mean and variance in windows of `sigma` pixels."""
     mean = _window(image, sigma)
     variance = np.maximum(_window(image * image, sigma) - mean * mean, 0)
@@ -34,7 +35,7 @@ def image_statistics(image: Float32[ndarray, "h w"], decoded: Bool[ndarray, "h w
 
 
 def matching_costs(
-    image: Float32[ndarray, "h w"],
+    image: Layer,
     statistics: Statistics,
     lines: EpipolarLines,
     inverse_distances: Float64[ndarray, "k"],
@@ -54,7 +55,7 @@ def matching_costs(
     return out
 
 
-def _neighbours(picture: Float32[ndarray, "h w"]) -> UInt32[ndarray, "h*w"]:
+def _neighbours(picture: Layer) -> UInt32[ndarray, "h*w"]:
     """Each pixel of a picture between 0 and 1, and those to the right and below, as bytes: one access gets all four."""
     values = np.rint(255 * picture).astype(np.uint32)
     out = values.copy()
@@ -63,13 +64,7 @@ def _neighbours(picture: Float32[ndarray, "h w"]) -> UInt32[ndarray, "h*w"]:
     return out.ravel()
 
 
-def correlations(
-    image: Float32[ndarray, "h w"],
-    statistics: Statistics,
-    coords: Float32[ndarray, "h w 2"],
-    grid: DrawnGrid,
-    sigma: float,
-) -> Float32[ndarray, "h w"]:
+def correlations(image: Layer, statistics: Statistics, coords: Coords, grid: DrawnGrid, sigma: float) -> Layer:
     """Correlation of image and pattern at given coordinates."""
     mean, variance = statistics
     drawn = grid.at(coords)[..., 0]

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32
 from numpy import ndarray
 
+from sl_nerfstudio.decoding.decoder import Coords, Mask
 from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of, ray_of, view_of
 from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.grid import gaussian_window
@@ -42,7 +43,7 @@ class EpipolarLines:
     ray: Float64[ndarray, "h w 3"]
     centre: Float64[ndarray, "3"]
     projector: Device
-    offset: Float32[ndarray, "h w 2"]
+    offset: Coords
 
     @staticmethod
     def of(camera: Device, projector: Device, T_camera_projector: Float64[ndarray, "4 4"]) -> "EpipolarLines":
@@ -56,19 +57,19 @@ class EpipolarLines:
         """The lines of the pixels in a box."""
         return replace(self, ray=np.ascontiguousarray(self.ray[box]), offset=np.ascontiguousarray(self.offset[box]))
 
-    def at(self, w: Float64[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
+    def at(self, w: Float64[ndarray, "h w"]) -> Coords:
         """Coordinates at inverse distances; NaN where the projector does not see the point."""
         out = np.empty(self.offset.shape, dtype=np.float32)
         _follow(*self.arrays, w, out)
         return out
 
-    def slopes(self, w: Float64[ndarray, "h w"]) -> Float32[ndarray, "h w 2"]:
+    def slopes(self, w: Float64[ndarray, "h w"]) -> Coords:
         """Derivative of the coordinates by the inverse distance."""
         out = np.empty(self.offset.shape, dtype=np.float32)
         _slopes(*self.arrays, w, out)
         return out
 
-    def nearest(self, coords: Float32[ndarray, "h w 2"]) -> Float64[ndarray, "h w"]:
+    def nearest(self, coords: Coords) -> Float64[ndarray, "h w"]:
         """Inverse distances at which the lines are nearest to given coordinates; NaN where there is none in front."""
         out = np.empty(coords.shape[:2])
         _nearest(*self.arrays, coords, out)
@@ -86,12 +87,7 @@ class EpipolarLines:
         return *for_loops(self.projector), self.ray, self.centre, self.offset
 
 
-def with_offset(
-    lines: EpipolarLines,
-    coords: Float32[ndarray, "h w 2"],
-    period: float,
-    pixels_a_period: float,
-) -> EpipolarLines:
+def with_offset(lines: EpipolarLines, coords: Coords, period: float, pixels_a_period: float) -> EpipolarLines:
     """Lines that run through decoded coordinates, on average over a window: poses and lenses are not known exactly."""
     apart = coords - lines.at(lines.nearest(coords))
     good = np.hypot(apart[..., 0], apart[..., 1]) < AGREEMENT * period  # False for NaN
@@ -102,11 +98,7 @@ def with_offset(
 
 
 def hypotheses(
-    lines: EpipolarLines,
-    coords: Float32[ndarray, "h w 2"],
-    w: Float64[ndarray, "h w"],
-    mask: Bool[ndarray, "h w"],
-    period: float,
+    lines: EpipolarLines, coords: Coords, w: Float64[ndarray, "h w"], mask: Mask, period: float
 ) -> Float64[ndarray, "k"] | None:
     """Evenly spaced inverse distances around those of the decoded pixels; None where hardly any is near its line.
 
@@ -143,7 +135,7 @@ def _half_width(rays: Float64[ndarray, "n 3"]) -> float:
     return min(float(np.sqrt(1 - min(cosine, 1.0) ** 2)), 0.5)
 
 
-def pixels_a_period(coords: Float32[ndarray, "h w 2"], period: float) -> float | None:
+def pixels_a_period(coords: Coords, period: float) -> float | None:
     """Pixels of the image in a period of the pattern, median; None where hardly anything is decoded."""
     by_x, by_y = np.diff(coords[:-1], axis=1), np.diff(coords[:, :-1], axis=0)
     smooth = np.ones(by_x.shape[:2], dtype=bool)

@@ -9,19 +9,12 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int32
+from jaxtyping import Float32, Float64, Int32
 from numpy import ndarray
 from scipy.ndimage import find_objects
 
-from sl_nerfstudio.decoding.decoder import drop_small_regions, large_regions, torn
-from sl_nerfstudio.decoding.grid_fit import (
-    DrawnGrid,
-    GridLight,
-    draw_sharpnesses,
-    fit_shift,
-    flattened,
-    measure_light,
-)
+from sl_nerfstudio.decoding.decoder import Coords, Layer, Mask, drop_small_regions, large_regions, torn
+from sl_nerfstudio.decoding.grid_fit import DrawnGrid, GridLight, draw_sharpnesses, fit_shift, flattened, measure_light
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.matching.costs import Statistics, correlations, image_statistics, matching_costs
 from sl_nerfstudio.matching.lines import (
@@ -66,12 +59,12 @@ LEAST_AREA = 1.0  # smaller regions are left out, periods squared
 class DecodedImage:
     """Input of the matching."""
 
-    grey: Float32[ndarray, "h w"]
-    coords: Float32[ndarray, "h w 2"]  # decoded, pattern pixels; NaN where not
-    mask: Bool[ndarray, "h w"]  # where the decoder saw the pattern
+    grey: Layer
+    coords: Coords  # decoded, pattern pixels; NaN where not
+    mask: Mask  # where the decoder saw the pattern
 
     @property
-    def decoded(self) -> Bool[ndarray, "h w"]:
+    def decoded(self) -> Mask:
         """Pixels that have coordinates."""
         return np.isfinite(self.coords[..., 0])
 
@@ -84,7 +77,7 @@ class DecodedImage:
 class MatchedImage:
     """Matches of all pixels of an image, and what tells the right ones from the wrong ones."""
 
-    coords: Float32[ndarray, "h w 2"]  # fitted to the image; NaN where not
+    coords: Coords  # fitted to the image; NaN where not
     features: Float32[ndarray, "h w f"]
 
 
@@ -96,7 +89,7 @@ class LineMatcher:
 
     def match(
         self, image: DecodedImage, camera: Device, projector: Device, T_camera_projector: Float64[ndarray, "4 4"]
-    ) -> Float32[ndarray, "h w 2"]:
+    ) -> Coords:
         """Coordinates in place of the decoded ones; these, where hardly any agree with what is matched.
 
         The pose's baseline may have any length. Coordinates are pattern pixels, NaN where none are probably right.
@@ -144,7 +137,7 @@ class LineMatcher:
 
     def _in_strips(
         self,
-        grey: Float32[ndarray, "h w"],
+        grey: Layer,
         statistics: Statistics,
         lines: EpipolarLines,
         w: Float64[ndarray, "k"],
@@ -187,7 +180,7 @@ class LineMatcher:
         return draw_sharpnesses(self.pattern.render(), self.pattern.period)
 
 
-def _box(seen: Bool[ndarray, "h w"], margin: int) -> tuple[slice, slice]:
+def _box(seen: Mask, margin: int) -> tuple[slice, slice]:
     """The rectangle that holds all pixels, of which there must be some, with a margin."""
     rows, columns = (slice(max(s.start - margin, 0), s.stop + margin) for s in find_objects(seen.astype(np.uint8))[0])
     return rows, columns
@@ -208,13 +201,7 @@ class LineFit:
     grid: DrawnGrid
     pixels_a_period: float
 
-    def fitted(
-        self,
-        image: Float32[ndarray, "h w"],
-        lines: EpipolarLines,
-        w: Float64[ndarray, "h w"],
-        decoded: Bool[ndarray, "h w"],
-    ) -> Float32[ndarray, "h w 2"]:
+    def fitted(self, image: Layer, lines: EpipolarLines, w: Float64[ndarray, "h w"], decoded: Mask) -> Coords:
         """Coordinates; NaN in small regions. Planes and shifts are those of the pixels that were `decoded`."""
         coords = lines.at(w)
         out = np.full_like(coords, np.nan)
@@ -224,13 +211,8 @@ class LineFit:
         return out
 
     def _region(
-        self,
-        image: Float32[ndarray, "h w"],
-        lines: EpipolarLines,
-        w: Float64[ndarray, "h w"],
-        inside: Bool[ndarray, "h w"],
-        decoded: Bool[ndarray, "h w"],
-    ) -> Float32[ndarray, "h w 2"]:
+        self, image: Layer, lines: EpipolarLines, w: Float64[ndarray, "h w"], inside: Mask, decoded: Mask
+    ) -> Coords:
         period, size, light = np.float32(self.grid.period), self.pixels_a_period, GridLight.even(image.shape)
         trust = (inside & decoded).astype(np.float32)
         slope = lines.slopes(w)
@@ -247,18 +229,12 @@ class LineFit:
             _take(fit.shift, fit.variance, direction, (DEPENDENT, DETAIL**2, ACROSS**2, LARGEST_SHIFT), total)
         return flat + total * period
 
-    def _smooth(
-        self,
-        w: Float64[ndarray, "h w"],
-        inside: Bool[ndarray, "h w"],
-        trust: Float32[ndarray, "h w"],
-        slope: Float32[ndarray, "h w"],
-    ) -> Float64[ndarray, "h w"]:
+    def _smooth(self, w: Float64[ndarray, "h w"], inside: Mask, trust: Layer, slope: Layer) -> Float64[ndarray, "h w"]:
         """Inverse distances of planes that are near the pixel's own match, along its line."""
         unit = float(np.median(w[inside]))
         scaled = np.where(inside, w / unit, 1).astype(np.float32)
 
-        def is_near(apart: Float32[ndarray, "h w 2"], limit: float) -> Bool[ndarray, "h w"]:
+        def is_near(apart: Coords, limit: float) -> Mask:
             return np.abs(apart[..., 0]) * unit * slope < limit * self.grid.period
 
         windows = [(window * self.pixels_a_period, limit) for window, limit in SMOOTHING]
@@ -321,10 +297,10 @@ RIGHT = Logistic(-4.081, (0.0741, -0.0053, 2.5316, -0.7949, 2.3923, 0.5960, 3.24
 
 def features_of(
     matches: StereoMatches,
-    fitted: Float32[ndarray, "h w 2"],
-    correlation: Float32[ndarray, "h w"],
-    decoded: Float32[ndarray, "h w 2"],
-    mask: Bool[ndarray, "h w"],
+    fitted: Coords,
+    correlation: Layer,
+    decoded: Coords,
+    mask: Mask,
     period: float,
     pixels_a_period: float,
 ) -> Float32[ndarray, "h w f"]:
@@ -348,7 +324,7 @@ def features_of(
     ).astype(np.float32)
 
 
-def _distance_from_jumps(coords: Float32[ndarray, "h w 2"], jump: float) -> Float64[ndarray, "h w"]:
+def _distance_from_jumps(coords: Coords, jump: float) -> Float64[ndarray, "h w"]:
     """Pixels to the nearest one beside which coordinates jump or end."""
     ended = np.where(np.isfinite(coords[..., :1]), coords, np.float32(OUTSIDE_PX))
     smooth = (~torn(ended, jump)).astype(np.uint8)

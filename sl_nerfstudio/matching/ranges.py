@@ -5,9 +5,10 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Int32, Int64
+from jaxtyping import Int32, Int64
 from numpy import ndarray
 
+from sl_nerfstudio.decoding.decoder import Mask
 from sl_nerfstudio.matching.lines import UNKNOWN
 
 TILE = 16  # side of a tile, pixels
@@ -42,7 +43,7 @@ class TriedRanges:
         return TriedRanges(self.first[rows].copy(), self.count[rows].copy())
 
     @staticmethod
-    def near(decoded: Int32[ndarray, "h w"], mask: Bool[ndarray, "h w"], count: int) -> "TriedRanges":
+    def near(decoded: Int32[ndarray, "h w"], mask: Mask, count: int) -> "TriedRanges":
         """The ranges that are tried: around the numbers that were decoded in a tile and beside it, or all.
 
         `decoded` are the numbers of the inverse distances that were decoded, `UNKNOWN` where nothing was; `mask` shows
@@ -74,7 +75,7 @@ def _greatest(values: Int32[ndarray, "h w"]) -> Int32[ndarray, "a b"]:
     return cv2.dilate(tiles, np.ones((3, 3))).astype(np.int32)
 
 
-def _sum(values: Bool[ndarray, "h w"]) -> Int32[ndarray, "a b"]:
+def _sum(values: Mask) -> Int32[ndarray, "a b"]:
     """How many pixels there are in a tile and the eight around it."""
     tiles = _tiles(values, False).sum(-1).astype(np.float32)
     return cv2.boxFilter(tiles, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT).astype(np.int32)

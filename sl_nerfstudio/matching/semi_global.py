@@ -11,9 +11,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Int32, UInt8
 from numpy import ndarray
 
+from sl_nerfstudio.decoding.decoder import Layer
 from sl_nerfstudio.matching.costs import OUTSIDE
 from sl_nerfstudio.matching.ranges import TILE, TriedRanges
 from sl_nerfstudio.parallel import compiled
@@ -29,12 +30,10 @@ _NEVER = np.int16(16000)  # more than any way costs
 class StereoMatches:
     """The best of the inverse distances that were tried, for every pixel."""
 
-    index: Float32[ndarray, "h w"]  # its number, with the fraction of a step that a parabola through the sums says;
+    index: Layer  # its number, with the fraction of a step that a parabola through the sums says;
     # NaN where none was tried
     cost: UInt8[ndarray, "h w"]  # its own, without changes
-    margin: Float32[
-        ndarray, "h w"
-    ]  # by how much the sums of the best rival are larger, at most by one change for each way
+    margin: Layer  # of the best rival's sums over its own, at most one change for each way
 
     def part(self, rows: slice) -> "StereoMatches":
         """The matches of some rows."""
@@ -58,38 +57,29 @@ def match_semi_globally(
     sums = np.zeros(costs.shape, dtype=np.uint16)
     places = tried.first, tried.count, tried.start
     for step in (1, -1):
-        _add_ways(costs, *places, decoded, step, SMALL, LARGE, STEEPEST, sums)
+        _add_ways(costs, *places, decoded, step, sums)
     index = np.full(decoded.shape, np.nan, dtype=np.float32)
     cost, margin = np.full(decoded.shape, OUTSIDE, dtype=np.uint8), np.zeros(decoded.shape, dtype=np.float32)
-    _choose(costs, sums, *places, APART, 8 * LARGE, index, cost, margin)
+    _choose(costs, sums, *places, index, cost, margin)
     return StereoMatches(index, cost, margin)
 
 
 @compiled
 def _add_ways(
-    costs: ndarray,
-    first: ndarray,
-    count: ndarray,
-    start: ndarray,
-    decoded: ndarray,
-    step: int,
-    small: int,
-    large: int,
-    steepest: int,
-    sums: ndarray,
+    costs: ndarray, first: ndarray, count: ndarray, start: ndarray, decoded: ndarray, step: int, sums: ndarray
 ) -> None:
     """Add to `sums` what the least costly way to each pixel costs, less what all its ways share, for four directions.
 
     With a step of 1, they come from the left and from the three pixels above; with -1 from the opposite ones.
     """
     h, w = decoded.shape
-    beyond = steepest + 1  # places on both sides of a way for inverse distances that are not tried
+    beyond = STEEPEST + 1  # places on both sides of a way for inverse distances that are not tried
     # the ways from the pixels before: none costs less than never beyond the image, and where nothing is tried
     shape = (3, w + 2, (first + count).max() + 2 * beyond)
     before, here = np.full(shape, _NEVER, dtype=np.int16), np.full(shape, _NEVER, dtype=np.int16)
     least_before, least_here = np.full(shape[:2], _NEVER, dtype=np.int16), np.full(shape[:2], _NEVER, dtype=np.int16)
     side = np.full((2, shape[2]), _NEVER, dtype=np.int16)
-    away, near = np.int16(large), np.int16(small)
+    away, near = np.int16(LARGE), np.int16(SMALL)
     for i in range(h):
         row = i if step > 0 else h - 1 - i
         if row // TILE != (row - step) // TILE or row // TILE != (row - 2 * step) // TILE:
@@ -106,28 +96,25 @@ def _add_ways(
                 continue
             place = start[a, b] + ((row % TILE) * TILE + column % TILE) * n
             own, left = costs[place : place + n], side[j % 2, low : low + n]
-            slope = _slope(decoded, row, column, 0, -step, steepest)
+            slope = _slope(decoded, row, column, 0, -step)
             least_side = _go_on(own, side[(j + 1) % 2], least_side, low - slope, near, away, left)
             for m in range(3):
-                slope = _slope(decoded, row, column, -step, m - 1, steepest)
-                came, least, out = (
-                    before[m, column + m],
-                    least_before[m, column + m],
-                    here[m, column + 1, low : low + n],
-                )
+                slope = _slope(decoded, row, column, -step, m - 1)
+                came, least = before[m, column + m], least_before[m, column + m]
+                out = here[m, column + 1, low : low + n]
                 least_here[m, column + 1] = _go_on(own, came, least, low - slope, near, away, out)
             _add(left, here[:, column + 1, low : low + n], sums[place : place + n])
         before, here, least_before, least_here = here, before, least_here, least_before
 
 
 @compiled
-def _slope(decoded: ndarray, row: int, column: int, down: int, right: int, steepest: int) -> int:
+def _slope(decoded: ndarray, row: int, column: int, down: int, right: int) -> int:
     """Steps of the inverse distance from the pixel before to this one; 0 where there is a jump or nothing decoded."""
     before, beside = row + down, column + right
     if before < 0 or before >= decoded.shape[0] or beside < 0 or beside >= decoded.shape[1]:
         return 0
     steps = decoded[row, column] - decoded[before, beside]
-    return steps if abs(steps) <= steepest else 0
+    return steps if abs(steps) <= STEEPEST else 0
 
 
 @compiled
@@ -162,8 +149,6 @@ def _choose(
     first: ndarray,
     count: ndarray,
     start: ndarray,
-    apart: int,
-    most: int,
     index: ndarray,
     cost: ndarray,
     margin: ndarray,
@@ -180,9 +165,9 @@ def _choose(
             for k in range(1, n):
                 if total[k] < total[best]:
                     best = k
-            rival = np.int64(total[best]) + most
+            rival = np.int64(total[best]) + 8 * LARGE
             for k in range(n):
-                if abs(k - best) > apart:
+                if abs(k - best) > APART:
                     rival = min(rival, np.int64(total[k]))
             cost[row, column], margin[row, column] = costs[place + best], rival - total[best]
             middle = min(max(best, 1), n - 2)

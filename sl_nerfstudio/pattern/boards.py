@@ -48,53 +48,75 @@ DICTIONARIES = tuple(name.removeprefix("DICT_") for name in dir(cv2.aruco) if na
 
 
 @dataclass(frozen=True)
-class Chessboard:
-    """A chessboard with `columns` x `rows` inner corners, where four squares meet; the upper left square is black.
-
-    Where both numbers are even, or both are odd, it looks the same after half a turn.
-    """
+class _Checkered:
+    """What boards of alternating squares have in common."""
 
     columns: int
     rows: int
     square: float  # side of a square, mm
 
+    @property
+    def squares(self) -> tuple[int, int]:
+        """Number of squares from left to right and from top to bottom."""
+        return self.columns, self.rows
+
+    @property
+    def _first_is_black(self) -> bool:
+        return True
+
+    def corners(self) -> Float64[ndarray, "n 2"]:
+        """(x, y) in mm of every corner where four squares meet, row by row."""
+        columns, rows = self.squares
+        x, y = np.meshgrid(np.arange(1, columns), np.arange(1, rows))
+        return np.stack([x.ravel(), y.ravel()], -1) * float(self.square)
+
+    def black(self) -> Bool[ndarray, "rows columns"]:
+        """Mask of the black squares."""
+        columns, rows = self.squares
+        return np.add.outer(np.arange(rows), np.arange(columns)) % 2 == int(not self._first_is_black)
+
+    def black_areas(self) -> Float64[ndarray, "n 4"]:
+        """Rectangles in mm (left, top, right, bottom) that do not overlap and are together all that is black."""
+        return _areas(self.black(), self.square)
+
+    def _check(self, least: int, what: str) -> None:
+        if not least <= min(self.columns, self.rows) <= max(self.columns, self.rows) <= MOST_SQUARES:
+            raise ValueError(f"a board has {least} to {MOST_SQUARES} {what} a side, got {self.columns} x {self.rows}")
+        if not 0 < self.square < float("inf"):
+            raise ValueError(f"squares must be larger than 0 mm, got {self.square:g} mm")
+
+
+@dataclass(frozen=True)
+class Chessboard(_Checkered):
+    """A chessboard with `columns` x `rows` inner corners, where four squares meet; the upper left square is black.
+
+    Where both numbers are even, or both are odd, it looks the same after half a turn.
+    """
+
     def __post_init__(self) -> None:
         """Raises ValueError for a board that no detector finds."""
-        _check(self.columns, self.rows, self.square, least=3, what="inner corners")
+        self._check(least=3, what="inner corners")
 
     @property
     def squares(self) -> tuple[int, int]:
         """Number of squares from left to right and from top to bottom."""
         return self.columns + 1, self.rows + 1
 
-    def corners(self) -> Float64[ndarray, "n 2"]:
-        """(x, y) in mm of every inner corner, row by row."""
-        return _grid_corners(self.columns, self.rows, self.square)
-
-    def black(self) -> Bool[ndarray, "rows columns"]:
-        """Mask of the black squares."""
-        columns, rows = self.squares
-        return np.add.outer(np.arange(rows), np.arange(columns)) % 2 == 0
-
-    def black_areas(self) -> Float64[ndarray, "n 4"]:
-        """Rectangles in mm (left, top, right, bottom) that do not overlap and are together all that is black."""
-        return _areas(self.black(), self.square)
-
 
 @dataclass(frozen=True)
-class CharucoBoard:
-    """A chessboard of `columns` x `rows` squares with a marker in every white square, numbered row by row."""
+class CharucoBoard(_Checkered):
+    """A chessboard of `columns` x `rows` squares with a marker in every white square, numbered row by row.
 
-    columns: int
-    rows: int
-    square: float  # side of a square, mm
+    OpenCV numbers its corners as `corners` lists them.
+    """
+
     marker: float  # side of a marker with its black border, mm
     dictionary: str  # set of the markers, one of DICTIONARIES
     legacy: bool = False  # OpenCV before 4.6: the upper left square is white if the number of rows is even
 
     def __post_init__(self) -> None:
         """Raises ValueError for a board that cannot be printed or detected."""
-        _check(self.columns, self.rows, self.square, least=2, what="squares")
+        self._check(least=2, what="squares")
         if self.dictionary not in DICTIONARIES:
             raise ValueError(f"there is no dictionary {self.dictionary}; OpenCV's are {', '.join(DICTIONARIES)}")
         if not 0 < self.marker < self.square:
@@ -104,18 +126,8 @@ class CharucoBoard:
             raise ValueError(f"the board has {count} white squares, but {self.dictionary} has {available} markers")
 
     @property
-    def squares(self) -> tuple[int, int]:
-        """Number of squares from left to right and from top to bottom."""
-        return self.columns, self.rows
-
-    def corners(self) -> Float64[ndarray, "n 2"]:
-        """(x, y) in mm of every corner where four squares meet, row by row: the numbers that OpenCV gives them."""
-        return _grid_corners(self.columns - 1, self.rows - 1, self.square)
-
-    def black(self) -> Bool[ndarray, "rows columns"]:
-        """Mask of the black squares."""
-        first_is_white = self.legacy and self.rows % 2 == 0
-        return np.add.outer(np.arange(self.rows), np.arange(self.columns)) % 2 == int(first_is_white)
+    def _first_is_black(self) -> bool:
+        return not (self.legacy and self.rows % 2 == 0)
 
     def black_areas(self) -> Float64[ndarray, "n 4"]:
         """Rectangles in mm (left, top, right, bottom) that do not overlap and are together all that is black."""
@@ -126,7 +138,7 @@ class CharucoBoard:
             _areas(self._bits(number), module) + np.tile(place[::-1] * self.square + indent, 2)
             for number, place in enumerate(places)
         ]
-        return np.concatenate([_areas(self.black(), self.square), *markers])
+        return np.concatenate([super().black_areas(), *markers])
 
     @cached_property
     def _markers(self) -> cv2.aruco.Dictionary:
@@ -151,19 +163,6 @@ def draw_board(board: Board, pixels_per_square: int, margin: int = 1) -> UInt8[n
     for left, top, right, bottom in pixels:
         image[top:bottom, left:right] = 0
     return image
-
-
-def _check(columns: int, rows: int, square: float, least: int, what: str) -> None:
-    if not least <= min(columns, rows) <= max(columns, rows) <= MOST_SQUARES:
-        raise ValueError(f"a board has {least} to {MOST_SQUARES} {what} a side, got {columns} x {rows}")
-    if not 0 < square < float("inf"):
-        raise ValueError(f"squares must be larger than 0 mm, got {square:g} mm")
-
-
-def _grid_corners(columns: int, rows: int, square: float) -> Float64[ndarray, "n 2"]:
-    """Corners of squares without those on the board's outline, row by row."""
-    x, y = np.meshgrid(np.arange(1, columns + 1), np.arange(1, rows + 1))
-    return np.stack([x.ravel(), y.ravel()], -1) * float(square)
 
 
 def _areas(black: Bool[ndarray, "rows columns"], side: float) -> Float64[ndarray, "n 4"]:

@@ -16,6 +16,9 @@ from numpy import ndarray
 
 from sl_nerfstudio.parallel import compiled
 
+SYMBOLS = 5
+WINDOW = 3
+
 # Local search for code arrays whose 3x3 windows keep a minimum Hamming distance.
 #
 # Two tables count, for each of the 5^9 possible windows, how often it occurs upright and how often in the pattern
@@ -24,18 +27,9 @@ from sl_nerfstudio.parallel import compiled
 # that are passed on are `np.int64(1)` rather than 1: for each such constant, numba would compile the called function
 # anew.
 
-_SYMBOLS, _CELLS = 5, 9
+_CELLS = WINDOW**2
 _MOVES_PER_CELL = 3  # after that a margin counts as unreachable
 _RANDOM_MOVES = 0.1
-
-
-def resolve_conflicts(codes: Int[ndarray, "rows columns"], margin: int, turned_margin: int, seed: int) -> bool:
-    """Change `codes` in place until its 3x3 windows are far enough apart; False if that fails.
-
-    Any two differ in at least `margin` cells (1 to 3), and each differs in at least `turned_margin` cells
-    (0 to 3) from all windows of the pattern turned by 90, 180 or 270 degrees.
-    """
-    return bool(_search(codes, margin - 1, turned_margin - 1, seed, _MOVES_PER_CELL * codes.size))
 
 
 @compiled
@@ -63,12 +57,12 @@ def _in_ball(table: ndarray, key: int, change: ndarray, radius: int) -> int:
     total = table[key]
     if radius >= 1:
         for k in range(_CELLS):
-            for s in range(_SYMBOLS - 1):
+            for s in range(SYMBOLS - 1):
                 near = key + change[k, s]
                 total += table[near]
                 if radius >= 2:
                     for m in range(k + 1, _CELLS):
-                        for r in range(_SYMBOLS - 1):
+                        for r in range(SYMBOLS - 1):
                             total += table[near + change[m, r]]
     return total
 
@@ -76,22 +70,27 @@ def _in_ball(table: ndarray, key: int, change: ndarray, radius: int) -> int:
 @compiled
 def _conflicts(tables: ndarray, codes: ndarray, row: int, column: int, radius: int, turned_radius: int) -> int:
     """Occurrences near the window at (row, column), not counting the window itself."""
-    change = np.empty((_CELLS, _SYMBOLS - 1), dtype=np.int64)
+    change = np.empty((_CELLS, SYMBOLS - 1), dtype=np.int64)
     key, power = np.int64(0), np.int64(1)
     for cell in range(_CELLS - 1, -1, -1):
         digit = codes[row + cell // 3, column + cell % 3]
         key += digit * power
-        for s in range(_SYMBOLS - 1):
-            change[cell, s] = ((digit + s + 1) % _SYMBOLS - digit) * power
-        power *= _SYMBOLS
+        for s in range(SYMBOLS - 1):
+            change[cell, s] = ((digit + s + 1) % SYMBOLS - digit) * power
+        power *= SYMBOLS
     return _in_ball(tables[0], key, change, radius) - 1 + _in_ball(tables[1], key, change, turned_radius)
 
 
 @compiled
 def _search(codes: ndarray, radius: int, turned_radius: int, seed: int, moves: int) -> bool:
+    """Change `codes` in place until its 3x3 windows are far enough apart; False if that fails in so many moves.
+
+    No two are within `radius` cells (up to 2) of each other, and none within `turned_radius` (-1: any is allowed) of
+    a window of the pattern turned by 90, 180 or 270 degrees.
+    """
     np.random.seed(seed)
     rows, columns = codes.shape[0] - 2, codes.shape[1] - 2
-    tables = np.zeros((2, _SYMBOLS**_CELLS), dtype=np.int32)
+    tables = np.zeros((2, SYMBOLS**_CELLS), dtype=np.int32)
     for row in range(rows):
         for column in range(columns):
             _count(tables, codes, row, column, np.int64(1))
@@ -112,14 +111,14 @@ def _search(codes: ndarray, radius: int, turned_radius: int, seed: int, moves: i
 @compiled
 def _best_change(tables: ndarray, codes: ndarray, row: int, column: int, radius: int, turned_radius: int) -> None:
     """Re-sample the one cell of a window that leaves the fewest conflicts in all windows around that cell."""
-    best_cell, best_symbol, best_cost = np.random.randint(_CELLS), np.random.randint(_SYMBOLS), np.int64(2**30)
-    start = np.random.randint(_CELLS * _SYMBOLS)
+    best_cell, best_symbol, best_cost = np.random.randint(_CELLS), np.random.randint(SYMBOLS), np.int64(2**30)
+    start = np.random.randint(_CELLS * SYMBOLS)
     if np.random.random() < _RANDOM_MOVES:  # escapes from cycles
         _replace(tables, codes, row + best_cell // 3, column + best_cell % 3, best_symbol)
         return
-    for step in range(_CELLS * _SYMBOLS):
-        choice = (start + step) % (_CELLS * _SYMBOLS)
-        cell, symbol = choice // _SYMBOLS, choice % _SYMBOLS
+    for step in range(_CELLS * SYMBOLS):
+        choice = (start + step) % (_CELLS * SYMBOLS)
+        cell, symbol = choice // SYMBOLS, choice % SYMBOLS
         i, j = row + cell // 3, column + cell % 3
         old = np.int64(codes[i, j])
         if symbol == old:
@@ -153,8 +152,6 @@ def _replace(tables: ndarray, codes: ndarray, i: int, j: int, symbol: int) -> No
         codes[i, j] = symbol
 
 
-SYMBOLS = 5
-WINDOW = 3
 FULL_MARGINS = (3, 2)  # upright one misread cell of nine can be corrected; turned, one is noticed
 _BLOCK = 512  # windows compared with all others at a time
 SYMBOL_NAMES = (
@@ -186,7 +183,10 @@ def hamming_margins(codes: Int[ndarray, "rows columns"]) -> tuple[int, int]:
     and 270 degrees.
     """
     plain = windows(codes)
-    upright, *turned = (_most_alike(plain, windows_turned(plain, turns), turns > 0) for turns in range(4))
+    cells = plain.reshape(-1, WINDOW, WINDOW)
+    upright, *turned = (
+        _most_alike(plain, rotate_codes(cells, turns).reshape(plain.shape), turns > 0) for turns in range(4)
+    )
     return WINDOW**2 - upright, WINDOW**2 - max(upright, *turned)
 
 
@@ -204,11 +204,6 @@ def _most_alike(a: Int[ndarray, "n cells"], b: Int[ndarray, "m cells"], with_its
 
 def _one_hot(plain: Int[ndarray, "n cells"]) -> Float32[ndarray, "n symbols"]:
     return (plain[..., None] == np.arange(SYMBOLS)).reshape(len(plain), -1).astype(np.float32)
-
-
-def windows_turned(plain: Int[ndarray, "n cells"], quarter_turns: int, size: int = WINDOW) -> Int[ndarray, "n cells"]:
-    """Flattened windows, each turned clockwise about its own centre."""
-    return rotate_codes(plain.reshape(-1, size, size), quarter_turns).reshape(len(plain), size * size)
 
 
 def code_array(
@@ -256,4 +251,5 @@ def _attempt(rows: int, columns: int, seed: int, margin: int, turned_margin: int
     hopeless = margin <= 1 and turned_margin <= 0
     if min(rows, columns) < WINDOW or hopeless:
         return codes
-    return codes if resolve_conflicts(codes, margin, turned_margin, int(rng.integers(2**31))) else None
+    seed = int(rng.integers(2**31))
+    return codes if _search(codes, margin - 1, turned_margin - 1, seed, _MOVES_PER_CELL * codes.size) else None

@@ -25,11 +25,7 @@ PRESETS: dict[str, tuple[int, int, float]] = {
     "1280x720": (1280, 720, 20.0),  # a 16:9 projector: about 11 periods across a fifth of the image's width
     "1920x1080": (1920, 1080, 30.0),  # as many nodes: with more of them, codes do not stay far enough apart
     "3840x2160": (3840, 2160, 60.0),
-    "doe": (
-        800,
-        800,
-        25.0,
-    ),  # a diffractive element blurs: wider lines, and fewer nodes
+    "doe": (800, 800, 25.0),  # a diffractive element blurs: wider lines, and fewer nodes
 }
 LINE_SHARE, GAP_SHARE = 0.2, 0.3  # of the period
 MOST_NODES = 64 * 36
@@ -89,10 +85,7 @@ def longer_period(w: int, h: int) -> int:
     return period
 
 
-LAYOUTS: dict[str, type[PatternLayout]] = {
-    GridPattern.kind: GridPattern,
-    GrayCode.kind: GrayCode,
-}
+LAYOUTS: dict[str, type[PatternLayout]] = {GridPattern.kind: GridPattern, GrayCode.kind: GrayCode}
 """Every kind of pattern that pattern.json can describe."""
 
 

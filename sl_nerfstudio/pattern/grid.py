@@ -48,11 +48,7 @@ def gaussian_window(values: Float32[ndarray, "h w *k"], sigma: float) -> Float32
 
 
 def normalise_locally(
-    image: Float[ndarray, "h w"],
-    mask: Bool[ndarray, "h w"],
-    sigma: float,
-    mean: float = 0.5,
-    contrast: float = 0.25,
+    image: Float[ndarray, "h w"], mask: Bool[ndarray, "h w"], sigma: float, mean: float = 0.5, contrast: float = 0.25
 ) -> Float32[ndarray, "h w"]:
     """Remove albedo, shading and fall-off: the local mean and standard deviation become those of the pattern.
 
@@ -153,10 +149,7 @@ def sample_bilinear(image: Float32[ndarray, "h w"], uv: Float[ndarray, "*n 2"]) 
 
 
 # Offsets, in half gaps, of the segments that meet at a node, by symbol: left, right (y down); above, below (x right).
-_OFFSETS = np.array(
-    [[0, 0, 0, 0], [-1, 1, 0, 0], [1, -1, 0, 0], [0, 0, 1, -1], [0, 0, -1, 1]],
-    dtype=np.float64,
-)
+_OFFSETS = np.array([[0, 0, 0, 0], [-1, 1, 0, 0], [1, -1, 0, 0], [0, 0, 1, -1], [0, 0, -1, 1]], dtype=np.float64)
 MAX_NODES = 200  # a side
 MAX_PIXELS = 100_000_000
 _BAND = 16  # rows that are drawn at a time: they fit into the processor's cache

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 from scipy.ndimage import gaussian_filter, maximum_filter
 
+from sl_nerfstudio.decoding.decoder import Coords, Layer, Mask
 from sl_nerfstudio.parallel import compiled, compiled_range
 
 # Correlation of an image with a pattern in a window about each pixel, on one surface, whatever gain and offset.
@@ -26,10 +27,10 @@ _REACH = 2.0  # of a Gaussian window, standard deviations
 class PatternView:
     """One image, and what is predicted for its pixels."""
 
-    image: Float32[ndarray, "h w"]
-    coords: Float32[ndarray, "h w 2"]  # predicted, pattern pixels; only those that `usable` allows are read
-    depth: Float32[ndarray, "h w"]  # in pixel widths (see Prediction)
-    usable: Bool[ndarray, "h w"]  # on a predicted surface, and in the part of the image that shows the pattern
+    image: Layer
+    coords: Coords  # predicted, pattern pixels; only those that `usable` allows are read
+    depth: Layer  # in pixel widths (see Prediction)
+    usable: Mask  # on a predicted surface, and in the part of the image that shows the pattern
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ class Fit:
     sigma: Float32[ndarray, "n"]  # 1 sigma in the worse direction, from what gain, offset and shift leave unexplained
 
 
-def drawn(pattern: Float32[ndarray, "ph pw"], coords: Float32[ndarray, "h w 2"]) -> Float32[ndarray, "h w"]:
+def drawn(pattern: Float32[ndarray, "ph pw"], coords: Coords) -> Layer:
     """The pattern looked up at coordinates, bilinearly; the value at the border where they are outside or NaN."""
     place = np.nan_to_num(coords - np.float32(0.5))
     return cv2.remap(pattern, place[..., 0].copy(), place[..., 1].copy(), cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
@@ -239,7 +240,7 @@ class Ambiguity:
     decoys: Float32[ndarray, "d 2"]  # some farther away: no right coordinate is displaced by them
 
     @staticmethod
-    def of(pattern: Float32[ndarray, "h w"]) -> "Ambiguity":
+    def of(pattern: Layer) -> "Ambiguity":
         """Find the displacements from the autocorrelation of the whole pattern."""
         h, w = pattern.shape
         alike = _autocorrelation(pattern)
@@ -265,7 +266,7 @@ class Ambiguity:
         return Ambiguity(pitch, rivals, decoys)
 
 
-def _autocorrelation(pattern: Float32[ndarray, "h w"]) -> Float64[ndarray, "h w"]:
+def _autocorrelation(pattern: Layer) -> Float64[ndarray, "h w"]:
     """Autocorrelation at displacements up to half the pattern's size; zero displacement is at (h // 2, w // 2)."""
     h, w = pattern.shape
     one = np.fft.rfft2(np.ones_like(pattern), (2 * h, 2 * w))
@@ -299,7 +300,6 @@ class Measured:
 
     places: Int64[ndarray, "n 2"]  # row, column
     coords: Float32[ndarray, "n 2"]
-    along: Float32[ndarray, "n"]  # from the prediction, as a wrong depth would move it
     across: Float32[ndarray, "n"]  # from the prediction, as no wrong depth would move it
     correlation: Float32[ndarray, "n"]  # of image and pattern
     margin: Float32[ndarray, "n"]  # by which that is larger than at places with which this one can be confused
@@ -309,9 +309,7 @@ class Measured:
     sigma: Float32[ndarray, "n"]  # 1 sigma in the worse direction
 
 
-def measure(
-    view: PatternView, along: Float32[ndarray, "h w 2"], shown: ShownPattern, places: Int64[ndarray, "n 2"]
-) -> Measured:
+def measure(view: PatternView, along: Coords, shown: ShownPattern, places: Int64[ndarray, "n 2"]) -> Measured:
     """Find the pattern around its predicted place, about each of the given pixels, which must be usable."""
     pitch, rows, columns = shown.ambiguity.pitch, *places.T
     narrow = CorrelationWindow.gaussian(_NARROW * shown.pitch_px)
@@ -325,7 +323,6 @@ def measure(
     return Measured(
         places=places,
         coords=view.coords[rows, columns] + fit.shift,
-        along=(fit.shift * direction).sum(1),
         across=fit.shift[:, 0] * direction[:, 1] - fit.shift[:, 1] * direction[:, 0],
         correlation=fit.correlation,
         margin=_margins(view, shown, places, fit.shift, mean),
@@ -347,11 +344,7 @@ def correlation_at(
 
 
 def _margins(
-    view: PatternView,
-    shown: ShownPattern,
-    places: Int64[ndarray, "n 2"],
-    shift: Float32[ndarray, "n 2"],
-    mean: Float32[ndarray, "h w 2"],
+    view: PatternView, shown: ShownPattern, places: Int64[ndarray, "n 2"], shift: Float32[ndarray, "n 2"], mean: Coords
 ) -> Float32[ndarray, "n"]:
     """Correlation in a wide window, less the largest at displacements by which the pattern resembles itself."""
     rivals = shown.ambiguity.rivals
@@ -370,9 +363,7 @@ def _stride(shown: ShownPattern) -> int:
     return max(1, round(shown.pitch_px / _SAMPLES))
 
 
-def _spread(
-    view: PatternView, places: Int64[ndarray, "n 2"], fit: Fit, sigma: float, pitch: float
-) -> Float32[ndarray, "h w 2"]:
+def _spread(view: PatternView, places: Int64[ndarray, "n 2"], fit: Fit, sigma: float, pitch: float) -> Coords:
     """Displacements at all pixels: Gaussian means of those at which the search converged."""
     good = fit.step < _CONVERGED * pitch
     rows, columns = places[good].T

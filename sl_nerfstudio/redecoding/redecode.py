@@ -11,7 +11,7 @@ from numpy import ndarray
 from scipy.ndimage import find_objects, gaussian_filter
 
 from sl_nerfstudio.console import track
-from sl_nerfstudio.decoding.decoder import drop_small_regions
+from sl_nerfstudio.decoding.decoder import Coords, Layer, Mask, drop_small_regions
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
 from sl_nerfstudio.geometry.numerics import evenly_spaced
 from sl_nerfstudio.geometry.triangulation import pixel_centres, pixel_rays, world_pixels
@@ -47,12 +47,12 @@ _OWN = 2.0  # edge lengths: a hit this close before a point is the surface on wh
 class Prediction:
     """Prediction for each pixel of a frame; NaN where it sees no surface that the projector lights."""
 
-    coords: Float32[ndarray, "h w 2"]  # pattern pixels
-    along: Float32[ndarray, "h w 2"]  # unit direction in which a coordinate moves with the depth of its point
-    depth: Float32[ndarray, "h w"]  # distance from the camera over the focal length: the width of a pixel there
+    coords: Coords  # pattern pixels
+    along: Coords  # unit direction in which a coordinate moves with the depth of its point
+    depth: Layer  # distance from the camera over the focal length: the width of a pixel there
 
     @property
-    def known(self) -> Bool[ndarray, "h w"]:
+    def known(self) -> Mask:
         """Pixels that have a prediction."""
         return np.isfinite(self.coords).all(-1)
 
@@ -165,13 +165,13 @@ class RedecodedFacts:
 
 def redecode_frame(
     name: str,
-    image: Float32[ndarray, "h w"],
-    mask: Bool[ndarray, "h w"] | None,
-    decoded: Float32[ndarray, "h w 2"],
+    image: Layer,
+    mask: Mask | None,
+    decoded: Coords,
     predicted: Prediction,
     pattern: Float32[ndarray, "ph pw"],
     ambiguity: Ambiguity,
-) -> tuple[Float32[ndarray, "h w 2"], RedecodedFacts]:
+) -> tuple[Coords, RedecodedFacts]:
     """New coordinates of a frame, and what became of the old ones.
 
     `image` shows the pattern where `mask` says so (None: perhaps everywhere). Pixels are added where nothing was
@@ -195,13 +195,13 @@ def redecode_frame(
 
 def _redecode(
     view: PatternView,
-    along: Float32[ndarray, "h w 2"],
-    decoded: Float32[ndarray, "h w 2"],
+    along: Coords,
+    decoded: Coords,
     pattern: Float32[ndarray, "ph pw"],
     ambiguity: Ambiguity,
     pitch_px: float,
     facts: RedecodedFacts,
-) -> tuple[Float32[ndarray, "h w 2"], RedecodedFacts]:
+) -> tuple[Coords, RedecodedFacts]:
     """Decode a view again of which some decoded pixels are usable; `facts` has the numbers before."""
     pitch, old = ambiguity.pitch, np.isfinite(decoded).all(-1)
     checked = view.usable & old & _thinned(view.usable & old)
@@ -218,8 +218,7 @@ def _redecode(
     if limits is None:
         return decoded, facts
     good = limits.accept(found) & _inside(view)[tuple(places.T)]
-    changed = _changed(view, shown, found, before, good, limits)
-    wrong = _impossible(view, shown, found, before, good, limits)
+    changed, wrong = _changed(view, shown, found, before, good, limits)
     out = decoded.copy()
     out[tuple(places[changed].T)] = found.coords[changed]
     out[tuple(places[wrong].T)] = np.nan
@@ -235,7 +234,7 @@ def _redecode(
     )
 
 
-def _thinned(known: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
+def _thinned(known: Mask) -> Mask:
     """Every third pixel in both directions if there are many, else all."""
     step = 3 if known.sum() > _MANY else 1
     some = np.zeros_like(known)
@@ -243,7 +242,7 @@ def _thinned(known: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     return some
 
 
-def _inside(view: PatternView) -> Bool[ndarray, "h w"]:
+def _inside(view: PatternView) -> Mask:
     """Pixels whose four neighbours are on the same surface: at its border, surface and image may be a pixel apart."""
     depth = np.pad(np.where(view.usable, view.depth, np.float32(np.nan)), 1, constant_values=np.nan)
     here = depth[1:-1, 1:-1]
@@ -251,7 +250,7 @@ def _inside(view: PatternView) -> Bool[ndarray, "h w"]:
     return np.logical_and.reduce([np.abs(there - here) <= STEEPEST * here for there in around])  # False for NaN
 
 
-def _stretch(coords: Float32[ndarray, "h w 2"]) -> Float32[ndarray, "h w"]:
+def _stretch(coords: Coords) -> Layer:
     """Distance of a predicted coordinate from those of the neighbouring pixels; the larger neighbour counts."""
     total = np.zeros(coords.shape[:2], dtype=np.float32)
     for axis in (0, 1):
@@ -265,7 +264,7 @@ def _stretch(coords: Float32[ndarray, "h w 2"]) -> Float32[ndarray, "h w"]:
 
 def _as_shown(
     view: PatternView,
-    along: Float32[ndarray, "h w 2"],
+    along: Coords,
     pattern: Float32[ndarray, "ph pw"],
     ambiguity: Ambiguity,
     pitch_px: float,
@@ -277,9 +276,7 @@ def _as_shown(
     return max(tried, key=lambda shown: float(np.median(measure(view, along, shown, some).correlation)))
 
 
-def _elsewhere(
-    view: PatternView, along: Float32[ndarray, "h w 2"], shown: ShownPattern, places: Int64[ndarray, "n 2"]
-) -> Measured:
+def _elsewhere(view: PatternView, along: Coords, shown: ShownPattern, places: Int64[ndarray, "n 2"]) -> Measured:
     """Match with the prediction displaced by some pitches: places that are certainly wrong."""
     some = places[evenly_spaced(len(places), min(_ELSEWHERE, len(places)))]
     decoys = shown.ambiguity.decoys
@@ -297,42 +294,27 @@ def _changed(
     before: Float32[ndarray, "n 2"],
     good: Bool[ndarray, "n"],
     limits: AcceptanceLimits,
-) -> Bool[ndarray, "n"]:
-    """Accepted pixels that had no coordinate, or one that the image shows clearly less."""
-    old = np.isfinite(before).all(1)
-    changed = good & ~old
-    differs = np.abs(found.coords - before).max(1) > AGREES * shown.ambiguity.pitch  # False for NaN
-    other = np.flatnonzero(good & differs)
-    as_it_was = correlation_at(view, shown, found.places[other], before[other])
-    changed[other] = found.correlation[other] - as_it_was > limits.margin
-    return changed
+) -> tuple[Bool[ndarray, "n"], Bool[ndarray, "n"]]:
+    """Pixels that get the coordinate that was found, and decoded ones that cannot be right.
 
-
-def _impossible(
-    view: PatternView,
-    shown: ShownPattern,
-    found: Measured,
-    before: Float32[ndarray, "n 2"],
-    good: Bool[ndarray, "n"],
-    limits: AcceptanceLimits,
-) -> Bool[ndarray, "n"]:
-    """Decoded pixels far from what all frames predict, where the image shows what is predicted, though not sharply."""
-    predicted = view.coords[tuple(found.places.T)]
-    far = np.abs(before - predicted).max(1) > _FAR * shown.ambiguity.pitch  # False for NaN
-    doubtful = np.flatnonzero(far & ~good & (found.correlation >= limits.correlation) & (found.margin >= limits.margin))
-    wrong = np.zeros(len(before), dtype=bool)
-    as_it_was = correlation_at(view, shown, found.places[doubtful], before[doubtful])
-    wrong[doubtful] = found.correlation[doubtful] - as_it_was > limits.margin
-    return wrong
+    The first are accepted, and had no coordinate or one that the image shows clearly less. The others are decoded far
+    from what all frames predict, where the image shows what is predicted, though not sharply.
+    """
+    pitch, predicted = shown.ambiguity.pitch, view.coords[tuple(found.places.T)]
+    differs = good & (np.abs(found.coords - before).max(1) > AGREES * pitch)  # False for NaN
+    far = np.abs(before - predicted).max(1) > _FAR * pitch
+    doubtful = far & ~good & (found.correlation >= limits.correlation) & (found.margin >= limits.margin)
+    shown_less = np.zeros(len(before), dtype=bool)
+    old = np.flatnonzero(differs | doubtful)
+    as_it_was = correlation_at(view, shown, found.places[old], before[old])
+    shown_less[old] = found.correlation[old] - as_it_was > limits.margin
+    new = good & ~np.isfinite(before).all(1)
+    return new | (differs & shown_less), doubtful & shown_less
 
 
 def _without_specks(
-    coords: Float32[ndarray, "h w 2"],
-    decoded: Float32[ndarray, "h w 2"],
-    changed: Int64[ndarray, "n 2"],
-    pitch: float,
-    pitch_px: float,
-) -> Float32[ndarray, "h w 2"]:
+    coords: Coords, decoded: Coords, changed: Int64[ndarray, "n 2"], pitch: float, pitch_px: float
+) -> Coords:
     """Regions of a few cells are no evidence: what was changed in them is as it was."""
     kept = np.isfinite(drop_small_regions(coords, _TEAR * pitch, round(_CELLS * pitch_px**2))).all(-1)
     back = changed[~kept[tuple(changed.T)]]

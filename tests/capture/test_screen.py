@@ -4,6 +4,7 @@ import sys
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from sl_nerfstudio.cli.pattern import main
 from sl_nerfstudio.pattern.files import MOST_NODES, longer_period, read_layout
@@ -65,20 +66,13 @@ def test_a_written_pattern_is_shown_again(show, keyboard, tmp_path, capsys):
 
 
 def test_keys_lead_through_a_sequence(show, keyboard, capsys):
-    keyboard.press("SPACE", "RIGHT", "a", "LEFT", "LEFT", "LEFT", "RETURN")
+    keyboard.press("SPACE", "RIGHT", "a", "LEFT", "LEFT", "LEFT", *["RETURN"] * 12)
     show("--show", 0, *GRAY)
     patterns = list(GrayCode(64, 32, 8).sequence())
-    for screen, index in zip(keyboard.different(), (0, 1, 2, 1, 0, 1), strict=True):
+    indices = [0, 1, 2, 1, *range(12), 0]  # after the last comes the first
+    for screen, index in zip(keyboard.different(), indices, strict=True):
         assert np.array_equal(middle(screen, 64, 32)[..., 0], patterns[index])
     assert "  02  x bit 2\n" in capsys.readouterr().out
-
-
-def test_after_the_last_image_of_a_sequence_comes_the_first(show, keyboard, capsys):
-    keyboard.press(*["SPACE"] * 12)
-    show("--show", 0, *GRAY)
-    assert [line[2:4] for line in capsys.readouterr().out.splitlines() if line.startswith("  ")] == [
-        *(f"{k:02d}" for k in range(12)), "00",
-    ]  # fmt: skip
 
 
 def test_with_a_timer_every_image_is_shown_once(show, keyboard, capsys):
@@ -94,21 +88,6 @@ def test_a_pattern_larger_than_the_display_is_refused_before_it_is_written(show,
     assert "the display 1024 x 768" in said and "a pattern is never scaled" in said and not (tmp_path / "p").exists()
 
 
-def test_a_picture_that_was_changed_is_refused(show, tmp_path, capsys):
-    from PIL import Image
-
-    show(*SMALL)
-    Image.new("L", (160, 121)).save(tmp_path / "p" / "pattern.png")
-    fails(capsys, lambda: show("--show", 0), "is no grey image of 160 x 120 pixels, as pattern.json says")
-
-
-@pytest.mark.parametrize("number", [1, -1])
-def test_displays_that_are_not_there(show, capsys, tmp_path, number):
-    message = f"--show {number}: there is no display of this number; displays are 0 (1024 x 768)"
-    fails(capsys, lambda: show("--show", number), message)
-    assert not (tmp_path / "p").exists()
-
-
 def test_flags_that_do_not_fit(show, capsys):
     for flags, message in (
         (["--every", "1", *GRAY], "--every 1: give seconds above 0, together with --show"),
@@ -121,13 +100,18 @@ def test_flags_that_do_not_fit(show, capsys):
         assert message in capsys.readouterr().err
 
 
-def test_without_a_screen_the_reason_is_said(show, monkeypatch, capsys):
+def test_what_keeps_a_pattern_from_being_shown_is_said(show, monkeypatch, capsys, tmp_path):
+    for number in (1, -1):
+        message = f"--show {number}: there is no display of this number; displays are 0 (1024 x 768)"
+        fails(capsys, lambda number=number: show("--show", number), message)
+    assert not (tmp_path / "p").exists()
+    show(*SMALL)
+    Image.new("L", (160, 121)).save(tmp_path / "p" / "pattern.png")
+    fails(capsys, lambda: show("--show", 0), "is no grey image of 160 x 120 pixels, as pattern.json says")
     monkeypatch.setenv("SDL_VIDEODRIVER", "")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
+    sys.modules["pygame"].display.quit()
     fails(capsys, lambda: show("--show", 0), "there is no display to show anything on")
-
-
-def test_without_pygame_the_command_that_installs_it_is_said(show, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "pygame", None)
     fails(capsys, lambda: show("--show", 0), "pip install 'sl-nerfstudio[show]'")

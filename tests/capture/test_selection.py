@@ -16,6 +16,7 @@ from sl_nerfstudio.capture.selection import (
 from tests.capture.photographs import PATTERN, SIZE, homography, photograph
 
 GOOD = Exposure(0.0, 0.0)
+PICTURE = PATTERN.render(2)
 
 
 def view(shift=0.0, nodes=100, blur=0.1, light=GOOD, edge=None):
@@ -45,21 +46,15 @@ def test_the_first_view(seen, verdict):
     assert Selection((10, 10)).judge(seen, 0.0) is verdict
 
 
-def test_views_that_are_known_are_not_kept_again_even_later():
+def test_views_that_are_known_are_not_kept_again_and_there_is_a_pause_after_a_frame():
     selection = Selection((10, 10))
     for shift in (0.0, 50.0):
-        selection.add(view(shift), 0.0)
+        selection.add(view(shift))
     assert selection.judge(view(1.0), 60.0) is SelectionVerdict.KNOWN  # like the first, not the last
-    assert selection.judge(view(25.0), 60.0) is SelectionVerdict.KEEP
-
-
-def test_after_a_frame_there_is_a_pause_but_none_after_those_of_an_earlier_run():
-    selection = Selection((10, 10))
-    selection.add(view())
-    assert selection.judge(view(30.0), 0.0) is SelectionVerdict.KEEP
-    selection.add(view(), 5.0)
-    assert selection.judge(view(30.0), 5.9) is SelectionVerdict.WAIT
-    assert selection.judge(view(30.0), 6.0) is SelectionVerdict.KEEP
+    assert selection.judge(view(25.0), 0.0) is SelectionVerdict.KEEP  # no pause after frames of an earlier run
+    selection.add(view(80.0), 5.0)
+    assert selection.judge(view(25.0), 5.9) is SelectionVerdict.WAIT
+    assert selection.judge(view(25.0), 6.0) is SelectionVerdict.KEEP
 
 
 def test_how_often_each_node_was_seen():
@@ -79,19 +74,14 @@ def reader():
 
 
 @pytest.fixture(scope="module")
-def picture():
-    return PATTERN.render(2)
-
-
-@pytest.fixture(scope="module")
-def seen_view(reader, picture):
-    return reader.read(photograph(picture, homography()))
+def seen_view(reader):
+    return reader.read(photograph(PICTURE, homography()))
 
 
 @pytest.mark.parametrize("roll", [10, 100, 185, 260])
-def test_nodes_are_where_they_are(reader, picture, roll):
+def test_nodes_are_where_they_are(reader, roll):
     matrix = homography(roll=roll, scale=0.85)
-    found = reader.read(photograph(picture, matrix))
+    found = reader.read(photograph(PICTURE, matrix))
     true = cv2.perspectiveTransform(PATTERN.nodes().reshape(-1, 1, 2), matrix).reshape(found.uv.shape)
     inside = (true > 8).all(-1) & (true < np.array(SIZE) - 8).all(-1)
     assert found.seen[inside].mean() > 0.8
@@ -99,8 +89,8 @@ def test_nodes_are_where_they_are(reader, picture, roll):
     assert found.period == pytest.approx(17, rel=0.15)
 
 
-def test_large_images_are_read_at_a_smaller_size_but_in_their_own_pixels(reader, picture, seen_view):
-    large = cv2.resize(photograph(picture, homography()), None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
+def test_large_images_are_read_at_a_smaller_size_but_in_their_own_pixels(reader, seen_view):
+    large = cv2.resize(photograph(PICTURE, homography()), None, fx=3, fy=3, interpolation=cv2.INTER_CUBIC)
     found = reader.read(large)
     both = found.seen & seen_view.seen
     assert both.sum() > 0.9 * seen_view.seen.sum()
@@ -108,34 +98,17 @@ def test_large_images_are_read_at_a_smaller_size_but_in_their_own_pixels(reader,
     assert found.period == pytest.approx(3 * seen_view.period, rel=0.1)
 
 
-def test_an_image_without_the_pattern_shows_no_nodes(reader):
-    found = reader.read(np.full((300, 400, 3), 90, dtype=np.uint8))
-    assert not found.seen.any() and found.blur is None and found.light == Exposure(0.0, 0.0)
-
-
-def test_defocus_is_measured_in_periods(reader, picture, seen_view):
-    soft = reader.read(photograph(picture, homography(), blur=2.3))
-    assert seen_view.blur < 0.12 < soft.blur
-    assert soft.blur == pytest.approx(np.hypot(2.3, 0.5) / seen_view.period, abs=0.04)
-
-
-def test_the_difference_is_nothing_for_resting_devices_and_large_for_moved_ones(reader, picture, seen_view):
-    again = reader.read(photograph(picture, homography(), seed=1, light=140))
-    moved = reader.read(photograph(picture, homography(shift=(9.0, 0.0))))
+def test_the_difference_is_nothing_for_resting_devices_and_large_for_moved_ones(reader, seen_view):
+    again = reader.read(photograph(PICTURE, homography(), seed=1, light=140))
+    moved = reader.read(photograph(PICTURE, homography(shift=(9.0, 0.0))))
     assert seen_view.difference(again) < 0.1 and again.difference(seen_view) == seen_view.difference(again)
     assert seen_view.difference(moved) > 0.95
-
-
-def _view(uv, period=10.0):
-    return GridView(np.array(uv, dtype=np.float32).reshape(1, -1, 2), period, 0.1, Exposure(0.0, 0.0))
-
-
-def test_the_difference_counts_nodes():
-    nan = [np.nan, np.nan]
-    a = _view([[10, 10], [20, 10], [30, 10], nan])
-    b = _view([[12, 10], [23, 10], nan, [40, 10]])  # a fifth of a period, more than a quarter, gone, new
-    assert a.difference(b) == b.difference(a) == pytest.approx(3 / 4)
-    assert a.difference(a) == 0 and _view([nan]).difference(_view([nan])) == 1
+    some = [GridView(view().uv.copy(), 10.0, 0.1, GOOD) for _ in range(2)]
+    some[0].uv[0, :6] = np.nan  # new, or gone
+    some[1].uv[1, :4] += 3.0  # more than a quarter of a period
+    some[1].uv[2:] += 1.0
+    assert some[0].difference(some[1]) == some[1].difference(some[0]) == pytest.approx(0.1)
+    assert some[0].difference(some[0]) == 0 and view(nodes=0).difference(view(nodes=0)) == 1
 
 
 def test_light_is_measured_where_the_pattern_is():
@@ -150,8 +123,13 @@ def test_light_is_measured_where_the_pattern_is():
         assert (light.saturated, light.dark) == shares
 
 
-def test_without_a_pattern_light_and_edges_are_measured():
+def test_defocus_is_measured_in_periods_or_without_a_pattern_in_pixels(reader, seen_view):
+    soft = reader.read(photograph(PICTURE, homography(), blur=2.3))
+    assert seen_view.blur < 0.12 < soft.blur
+    assert soft.blur == pytest.approx(np.hypot(2.3, 0.5) / seen_view.period, abs=0.04)
+    nothing = reader.read(np.full((300, 400, 3), 90, dtype=np.uint8))
+    assert not nothing.seen.any() and nothing.blur is None and nothing.light == GOOD
     image = np.zeros((100, 100), dtype=np.uint8)
     image[:, 50:] = 200
-    seen_view = PlainReader().read(cv2.GaussianBlur(image, (0, 0), 3.0))
-    assert seen_view.uv.size == 0 and seen_view.edge == pytest.approx(3.0, abs=0.3) and seen_view.light.saturated == 0
+    plain = PlainReader().read(cv2.GaussianBlur(image, (0, 0), 3.0))
+    assert plain.uv.size == 0 and plain.edge == pytest.approx(3.0, abs=0.3) and plain.light.saturated == 0

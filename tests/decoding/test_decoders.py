@@ -1,25 +1,19 @@
 """Decoders behind one interface: how one is chosen, when its key changes, and that a new one is a file and an entry."""
 
-import pickle
-
 import numpy as np
 import pytest
 
 from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.decoders import DECODERS, GrayCodeDecoder, choose_decoder
-from sl_nerfstudio.decoding.grid import GridImageDecoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import LAYOUTS
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from tests.decoding.gray_captures import LAYOUT, exact_coords, photographs
-from tests.decoding.ramps_decoder import RampsDecoder
-from tests.pattern.ramps import Ramps
+from tests.decoding.ramps_decoder import Ramps, RampsDecoder
 
 GRID = GridPattern(w=160, h=120)
 GRAY = GrayCode(32, 24, 2)
-
-
 NAMES = [f"{k:02d}.png" for k in range(LAYOUT.images)]
 
 
@@ -38,7 +32,6 @@ def test_every_kind_of_pattern_has_a_default_decoder(tmp_path):
         (GRID, "graycode", r"p\.json: describes a coded grid, which --decoder graycode does not read"),
         (GRID, "best", r"--decoder best: there is no decoder of this name.*\n.*\n.*one of network, graycode"),
         (Ramps(4, 3), None, r"p\.json: describes a pair of ramps, which no decoder reads"),
-        (Ramps(4, 3), "network", r"p\.json: describes a pair of ramps, which no decoder reads"),
     ],
 )
 def test_a_decoder_that_does_not_suit_is_refused(tmp_path, layout, name, message):
@@ -72,27 +65,6 @@ def test_the_key_changes_with_everything_that_changes_results(monkeypatch, tmp_p
     fourth = key()
     monkeypatch.setattr(RampsDecoder, "name", "slopes")
     assert len({first, second, third, fourth, key()}) == 5
-
-
-def test_creating_a_decoder_loads_no_network_and_it_can_be_sent_to_another_process(monkeypatch):
-    def load(*_):
-        raise AssertionError("a network was loaded")
-
-    monkeypatch.setattr("sl_nerfstudio.decoding.grid.GridImageDecoder", load)
-    decoder = DECODERS["network"](GRID)
-    again = pickle.loads(pickle.dumps(decoder))
-    assert again.key == decoder.key and np.array_equal(again.layout.codes, GRID.codes)
-
-
-def test_the_network_decoder_reads_the_one_image_of_a_frame():
-    grid = GridPattern(w=400, h=400)
-    image = np.rint(255 * grid.render()[40:300, 60:340]).astype(np.uint8)
-    found, expected = DECODERS["network"](grid).decode([image], ["a.png"]), GridImageDecoder(grid).decode(image)
-    np.testing.assert_array_equal(found.coords, expected.coords)
-    np.testing.assert_array_equal(found.pattern, expected.pattern)
-    x, y = np.meshgrid(np.arange(280) + 60.5, np.arange(260) + 40.5)
-    error = np.linalg.norm(found.coords - np.stack([x, y], -1), axis=-1)[10:-10, 10:-10]
-    assert np.isfinite(error).mean() > 0.95 and np.nanmax(error) < 1 and np.nanmedian(error) < 0.1
 
 
 def test_a_stated_order_is_believed_unless_the_images_show_another():

@@ -1,5 +1,7 @@
 """Which node is which: the graph network, window matching, and consensus among neighbours."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -14,11 +16,7 @@ from sl_nerfstudio.decoding.grid_detection import (
     measure_noise,
     shows_readable_symbols,
 )
-from sl_nerfstudio.decoding.grid_graph import (
-    GridGraph,
-    agree,
-    believe,
-)
+from sl_nerfstudio.decoding.grid_graph import GridGraph
 from sl_nerfstudio.decoding.grid_phases import GridAppearance, rectify
 from sl_nerfstudio.pattern.codes import code_array
 from sl_nerfstudio.pattern.grid import GridPattern
@@ -37,12 +35,6 @@ def recogniser():
     return NodeRecogniser(GridPattern(w=480, h=400, codes=CODES))
 
 
-def graphs(damage, count=6):
-    for index in range(count):
-        rng = np.random.default_rng([9, index])
-        yield damage_graph(rng, CODES, damage, index % 4, 0.5)
-
-
 @pytest.mark.parametrize(
     "damage, most_wrong",
     [
@@ -54,31 +46,14 @@ def graphs(damage, count=6):
 )
 def test_nearly_every_node_finds_its_place_and_hardly_any_a_wrong_one(recogniser, damage, most_wrong):
     right = wrong = total = 0
-    for graph in graphs(damage):
+    for index in range(6):
+        graph = damage_graph(np.random.default_rng([9, index]), CODES, damage, index % 4, 0.5)
         assignment = recogniser.assign(graph.as_grid())
         assert assignment.turn == graph.turn
         same = (assignment.place == graph.place).all(-1)
         right, total = right + same.sum(), total + len(same)
         wrong += (~same & assignment.known).sum()
     assert right > 0.93 * total and wrong <= most_wrong * total
-
-
-def test_small_pieces_that_fit_several_places_are_dropped():
-    codes = np.tile(np.arange(4, dtype=np.int8).reshape(2, 2), (6, 6))  # the same windows everywhere
-    index = np.arange(9).reshape(3, 3)
-    neighbour = np.full((9, 4), -1, dtype=np.int32)
-    neighbour[index[:, :-1], 0], neighbour[index[:, 1:], 2] = index[:, 1:], index[:, :-1]
-    neighbour[index[:-1], 1], neighbour[index[1:], 3] = index[1:], index[:-1]
-    score = np.eye(5, dtype=np.float32)[codes[4:7, 4:7].reshape(-1)]
-    belief = np.full((9, 12, 12), -8, dtype=np.float32)
-    for k in range(9):
-        belief[k, 4 + k // 3, 4 + k % 3] = 0  # every node is certain, and all agree
-    graph = GridGraph(np.zeros((9, 2), np.float32), neighbour, score)
-    assert (agree(believe(belief, neighbour), graph, codes) < 0).all()
-    unique = np.random.default_rng(0).integers(0, 5, (12, 12)).astype(np.int8)
-    certain = GridGraph(graph.place, neighbour, np.eye(5, dtype=np.float32)[unique[4:7, 4:7].reshape(-1)])
-    settled = agree(believe(belief, neighbour), certain, unique)
-    assert (settled >= 0).all() and (settled[0] == (4, 4)).all()
 
 
 # A refused capture is told the causes that it has, each by its own measurement, and no others.
@@ -101,14 +76,10 @@ def radiance():
 
 
 @pytest.fixture(scope="module")
-def right():
-    return GridImageDecoder(GridPattern())
-
-
-@pytest.fixture(scope="module")
-def other():
+def decoders():
+    """The one of the pattern that is seen, and that of another one."""
     codes = np.random.default_rng(8).integers(0, 5, (40, 40)).astype(np.int8)
-    return GridImageDecoder(GridPattern(codes=codes))
+    return {"right": GridImageDecoder(GridPattern()), "other": GridImageDecoder(GridPattern(codes=codes))}
 
 
 def capture(radiance, gain=1.05, blur=0.0, turned=False):
@@ -128,43 +99,34 @@ def causes_told(decoder, image):
 
 
 @pytest.mark.parametrize(
-    ("fault", "told"),
+    ("decoder", "fault", "told", "perhaps"),  # of two faults one may hide the other
     [
-        ({"turned": True}, {"mirrored"}),
-        ({"blur": 3.0}, {"blurred"}),
-        ({"gain": 0.012}, {"too dark"}),
-        ({"gain": 40.0}, {"saturated"}),
+        ("right", {"turned": True}, {"mirrored"}, {}),
+        ("right", {"blur": 3.0}, {"blurred"}, {}),
+        ("right", {"gain": 0.012}, {"too dark"}, {}),
+        ("right", {"gain": 40.0}, {"saturated"}, {}),
+        ("right", {"gain": 10.0, "turned": True}, {"mirrored", "saturated"}, {}),
+        ("right", {"gain": 0.02, "blur": 3.0}, {}, {"too dark", "blurred"}),
+        ("other", {}, {"another pattern"}, {}),
+        ("other", {"turned": True}, {"another pattern"}, {}),
+        ("other", {"gain": 0.012}, {"too dark"}, {}),  # its symbols cannot be read
+        ("other", {"gain": 10.0}, {}, {"another pattern", "saturated"}),
     ],
 )
-def test_one_fault_is_told_alone(right, radiance, fault, told):
-    assert causes_told(right, capture(radiance, **fault)) == told
+def test_every_fault_is_told_and_none_is_made_up(decoders, radiance, decoder, fault, told, perhaps):
+    assert set(told) <= causes_told(decoders[decoder], capture(radiance, **fault)) <= {*told, *perhaps}
 
 
-def test_another_pattern_is_told_alone(other, radiance):
-    assert causes_told(other, capture(radiance)) == {"another pattern"}
-
-
-def test_a_scene_without_the_pattern_is_out_of_view(right):
+def test_a_scene_without_the_pattern_is_out_of_view(decoders):
     scene = np.full((240, 300), 60, np.uint8)
     cv2.circle(scene, (120, 100), 60, (150,), -1)
     cv2.rectangle(scene, (200, 30), (260, 200), (20,), -1)
     noise = np.random.default_rng(0).normal(0, 1.5, scene.shape)
-    assert causes_told(right, np.clip(scene + noise, 0, 255).astype(np.uint8)) == {"out of view"}
-
-
-def test_two_faults_are_both_told(right, other, radiance):
-    assert causes_told(right, capture(radiance, gain=10.0, turned=True)) == {"mirrored", "saturated"}
-    assert causes_told(other, capture(radiance, gain=10.0)) <= {"another pattern", "saturated"}
-
-
-def test_of_two_faults_one_may_hide_the_other_but_none_is_made_up(right, other, radiance):
-    assert causes_told(right, capture(radiance, gain=0.02, blur=3.0)) <= {"too dark", "blurred"}
-    assert causes_told(other, capture(radiance, gain=0.012)) == {"too dark"}  # its symbols cannot be read
-    assert causes_told(other, capture(radiance, turned=True)) == {"another pattern"}
+    assert causes_told(decoders["right"], np.clip(scene + noise, 0, 255).astype(np.uint8)) == {"out of view"}
 
 
 @pytest.mark.parametrize("texture", ["checks", "noise", "bricks"])
-def test_texture_behind_the_object_is_no_reason_to_refuse(right, texture):
+def test_texture_behind_the_object_is_no_reason_to_refuse(decoders, texture):
     truth = make_setup(SynthConfig(resolution=280, frames=2, seed=3)).render(1, 2)
     y, x = np.mgrid[:280, :280]
     behind = {
@@ -173,7 +135,7 @@ def test_texture_behind_the_object_is_no_reason_to_refuse(right, texture):
         "bricks": ((x + 9 * (y // 10 % 2)) % 18 > 2) & (y % 10 > 1),
     }[texture]
     light = np.where(truth.mask, truth.radiance, 0.25 + 0.35 * np.clip(behind, 0, 1)).astype(np.float32)
-    decoded = right.decode(disturb_image(light, 1.05, 0.012, np.random.default_rng(0)))
+    decoded = decoders["right"].decode(disturb_image(light, 1.05, 0.012, np.random.default_rng(0)))
     both = decoded.decoded & truth.mask
     error = np.linalg.norm(decoded.coords[both] - truth.coords[both], axis=-1)
     assert both.sum() > 0.75 * truth.mask.sum() and (error > 10).mean() < 0.02
@@ -207,9 +169,8 @@ def test_the_blur_of_lines_is_measured(sigma):
     image = (0.1 + 0.6 * drawn + np.random.default_rng(0).normal(0, 0.01, drawn.shape)).astype(np.float32)
     rectified = rectify(image, GridAppearance(pattern.period, 0.0))
     maps = maps_of(rectified, 14.0, 0.0)
-    shift = np.pi * np.ones((2, *maps.mask.shape), np.float32)  # the first node lies half a period from the corner
-    vector = maps.vector * np.cos(shift[0])
-    measured = line_blur(rectified, type(maps)(maps.mask, vector, maps.symbol, maps.gradient), maps.mask > 0, pattern)
+    maps = replace(maps, vector=-maps.vector)  # the first node lies half a period from the corner
+    measured = line_blur(rectified, maps, maps.mask > 0, pattern)
     assert measured == pytest.approx(sigma, abs=0.03)
 
 

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
@@ -32,11 +33,16 @@ def _read(_):
     return globals()["_networks"].unet(CHANNELS_OF_AN_IMAGE)
 
 
-def test_a_decoder_that_has_read_an_image_here_can_be_given_to_another_process():
-    decoder = NetworkDecoder(GridPattern())
-    assert decoder.images is decoder.images
-    found = pickle.loads(pickle.dumps(decoder))
-    assert found.key == decoder.key and "images" not in vars(found)
+def test_decoders_load_networks_late_and_are_sent_to_other_processes_without_them(monkeypatch):
+    there, here = NetworkDecoder(GridPattern()), NetworkDecoder(GridPattern())
+    there.networks = LoadedNetworks()
+    assert there.key != here.key and there.key.startswith(here.key)  # the last digits of a GPU differ
+    assert there.images is there.images and there.images._networks is there.networks
+    assert here.images is not None
+    found = pickle.loads(pickle.dumps(here))
+    assert found.key == here.key and "images" not in vars(found)
+    monkeypatch.setattr("sl_nerfstudio.decoding.grid.GridImageDecoder", None)
+    assert NetworkDecoder(GridPattern()).key == here.key
 
 
 def test_one_process_computes_for_all_others_what_each_would():
@@ -47,14 +53,6 @@ def test_one_process_computes_for_all_others_what_each_would():
     with ProcessPoolExecutor(2, get_context("spawn"), _begin, (shared,)) as pool:
         for found in pool.map(_read, range(3)):
             np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-6)
-
-
-def test_frames_decoded_on_a_gpu_are_kept_apart():
-    """Their last digits differ; the others keep their key."""
-    there, here = NetworkDecoder(GridPattern()), NetworkDecoder(GridPattern())
-    there.networks = LoadedNetworks()
-    assert there.key != here.key and there.key.startswith(here.key)
-    assert there.images._networks is there.networks
 
 
 def test_a_gpu_that_fails_while_it_reads_is_said(monkeypatch):
@@ -90,24 +88,21 @@ def test_without_a_gpu_nothing_is_said():
         networks_for_all_processes("cuda")
 
 
-def test_a_driver_that_is_too_old_is_one_sentence(monkeypatch):
+def test_why_a_gpu_is_not_used_is_one_sentence(monkeypatch):
     def too_old():
-        import warnings
-
         warnings.warn("CUDA initialization: The NVIDIA driver on your system is too old\nUpdate it", stacklevel=1)
         return False
+
+    def unknown(*_, **__):
+        raise RuntimeError("CUDA error: no kernel image is available for execution on the device\nCompile with")
 
     monkeypatch.setattr(torch.cuda, "is_available", too_old)
     said = "The GPU is not used: CUDA initialization: The NVIDIA driver on your system is too old."
     assert usable_device(None) == ("cpu", said) and usable_device("cpu") == ("cpu", "")
     with pytest.raises(UserError, match=r"driver on your system is too old\n(.|\n)*leave --device out"):
         usable_device("cuda")
-
-
-def test_a_gpu_that_does_not_compute_is_left_alone(monkeypatch):
-    def unknown(*_, **__):
-        raise RuntimeError("CUDA error: no kernel image is available for execution on the device\nCompile with")
-
+    for found in (gpu_found, gpu_fault):
+        found.cache_clear()
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch, "ones", unknown)
     device, said = usable_device(None)

@@ -3,24 +3,12 @@
 import numpy as np
 import pytest
 
-from sl_nerfstudio.matching import semi_global
 from sl_nerfstudio.matching.lines import UNKNOWN
-from sl_nerfstudio.matching.semi_global import StereoMatches, match_semi_globally
+from sl_nerfstudio.matching.semi_global import APART, LARGE, SMALL, STEEPEST, StereoMatches, match_semi_globally
 from tests.matching.tiles import everything, is_tried, packed, random_ranges
 
-SMALL, LARGE, STEEPEST, APART = 20, 90, 2, 1
 WAYS = [(r, c) for r in (-1, 0, 1) for c in (-1, 0, 1) if (r, c) != (0, 0)]
 NEVER = 10**6
-
-
-def nothing_decoded(costs):
-    return np.full(costs.shape[:2], UNKNOWN, np.int32)
-
-
-def match(costs, decoded):
-    """With everything tried."""
-    tried = everything(costs.shape[:2], costs.shape[2])
-    return match_semi_globally(packed(costs, tried), tried, decoded)
 
 
 def sums_by_the_paper(costs, decoded):
@@ -57,10 +45,8 @@ def sums_by_the_paper(costs, decoded):
 
 @pytest.mark.parametrize("known", [0.0, 0.8])
 @pytest.mark.parametrize("whole", [True, False])
-@pytest.mark.parametrize("shape", [(6, 7, 5), (1, 9, 4), (8, 1, 3), (5, 4, 17), (33, 18, 6), (17, 50, 7)])
-def test_the_best_match_is_that_of_the_paper(monkeypatch, shape, whole, known):
-    for name in ("SMALL", "LARGE", "STEEPEST", "APART"):
-        monkeypatch.setattr(semi_global, name, globals()[name])
+@pytest.mark.parametrize("shape", [(6, 7, 5), (1, 9, 4), (8, 1, 3), (5, 4, 17), (33, 18, 9), (17, 50, 12)])
+def test_the_best_match_is_that_of_the_paper(shape, whole, known):
     rng, count = np.random.default_rng(sum(shape)), shape[2]
     costs = rng.integers(0, 256, shape).astype(np.uint8)
     decoded = np.where(rng.random(shape[:2]) < known, rng.integers(0, count, shape[:2]), UNKNOWN).astype(np.int32)
@@ -87,27 +73,26 @@ def test_the_best_match_is_that_of_the_paper(monkeypatch, shape, whole, known):
         np.testing.assert_array_equal(getattr(parts, name), getattr(found, name))
 
 
+def match(true, cost, among, decoded, hidden=slice(0)):
+    """Matches where the true ones have a cost, and all others one `among` these; `hidden` rows show nothing."""
+    costs = np.random.default_rng(4).integers(*among, (*true.shape, 100))
+    np.put_along_axis(costs, true[..., None], cost, axis=-1)
+    costs[hidden] = 127
+    tried = everything(true.shape, 100)
+    decoded = np.full(true.shape, UNKNOWN) if decoded is None else decoded
+    return match_semi_globally(packed(costs.astype(np.uint8), tried), tried, decoded.astype(np.int32))
+
+
 def test_a_slope_is_followed_through_pixels_that_show_nothing():
-    """A plane in steps, with noise and a stripe without any evidence."""
-    rng = np.random.default_rng(4)
     row, column = np.mgrid[:40, :60]
     true = (column / 4 + row / 8 + 3).astype(int)
-    costs = rng.integers(90, 160, (40, 60, 32))
-    np.put_along_axis(costs, true[..., None], 20, axis=-1)
-    costs[15:19] = 127
-    costs = costs.astype(np.uint8)
-    found = match(costs, nothing_decoded(costs))
+    found = match(true, 20, (90, 160), None, hidden=slice(15, 19))
     assert abs(found.index - true).max() < 2.5 and abs(found.index - true).mean() < 0.6
     assert np.median(found.margin[15:19]) < np.median(found.margin[:10])
 
 
 def test_a_steep_surface_is_followed_where_it_was_decoded():
     """Three steps a pixel: every change would be one of the costly kind, and the pixel's own evidence is weak."""
-    rng = np.random.default_rng(6)
-    true = np.broadcast_to(3 * np.arange(30) + 5, (25, 30)).astype(np.int32)
-    costs = rng.integers(60, 180, (25, 30, 100))
-    np.put_along_axis(costs, true[..., None], 75, axis=-1)
-    costs = costs.astype(np.uint8)
-    with_slope = match(costs, true + 7)  # the slope counts, not the place
-    without = match(costs, nothing_decoded(costs))
+    true = np.tile(3 * np.arange(30) + 5, (25, 1))
+    with_slope, without = (match(true, 75, (60, 180), decoded) for decoded in (true + 7, None))  # the place is off
     assert (abs(with_slope.index - true) < 1.5).mean() > 0.97 > 0.75 > (abs(without.index - true) < 1.5).mean()

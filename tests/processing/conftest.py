@@ -14,8 +14,7 @@ from sl_nerfstudio.processing.frames import FrameJob, FrameStageResult, FrameWor
 from sl_nerfstudio.processing.scan_poses import ScanPoses, find_scan_poses
 from sl_nerfstudio.registration.register import register
 from sl_nerfstudio.registration.result import Registration
-from tests.decoding.ramps_decoder import RampsDecoder
-from tests.pattern.ramps import Ramps
+from tests.decoding.ramps_decoder import Ramps, RampsDecoder
 from tests.processing.ramp_scan import RampScan, make_ramp_scan
 
 # For tests of what is made of an adjustment: rough, and without the question whether there are other minima.

@@ -15,8 +15,7 @@ from sl_nerfstudio.processing.frames import FrameJob
 from sl_nerfstudio.scan.images import encode_png
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.synthesise import Setup, make_setup
-from tests.decoding.ramps_decoder import RampsDecoder
-from tests.pattern.ramps import Ramps
+from tests.decoding.ramps_decoder import Ramps, RampsDecoder
 
 LAYOUT = Ramps(800, 800)
 NAMES = ("a 1", "a 2", "a 3", "a 10")

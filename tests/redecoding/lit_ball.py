@@ -8,7 +8,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.meshing.mesh import Mesh
-from sl_nerfstudio.pattern.grid import GridPattern
+from sl_nerfstudio.pattern.grid import GridPattern, sample_bilinear
 from tests.formulas import look_at, on_ball, pixels, rays
 from tests.meshing.solids import extracted
 
@@ -61,18 +61,8 @@ def picture(seed: int = 0) -> ndarray:
     total = np.zeros((CAMERA.h, CAMERA.w))
     for dy in (1 / 6, 3 / 6, 5 / 6):
         for dx in (1 / 6, 3 / 6, 5 / 6):
-            total += np.nan_to_num(_light(grid(seed), seen_at(x + dx, y + dy).coords)) / 9
+            total += np.nan_to_num(sample_bilinear(grid(seed), seen_at(x + dx, y + dy).coords)) / 9
     return (0.1 + (0.3 + 0.4 * x / CAMERA.w) * total).astype(np.float32)
-
-
-def _light(pattern: ndarray, coords: ndarray) -> ndarray:
-    u, v = np.nan_to_num(coords[..., 0] - 0.5), np.nan_to_num(coords[..., 1] - 0.5)
-    u, v = np.clip(u, 0, pattern.shape[1] - 1.001), np.clip(v, 0, pattern.shape[0] - 1.001)
-    i, j = np.floor(v).astype(int), np.floor(u).astype(int)
-    a, b = u - j, v - i
-    upper = (1 - a) * pattern[i, j] + a * pattern[i, j + 1]
-    lower = (1 - a) * pattern[i + 1, j] + a * pattern[i + 1, j + 1]
-    return np.where(np.isnan(coords[..., 0]), np.nan, (1 - b) * upper + b * lower)
 
 
 def with_holes(coords: ndarray, share: float, seed: int = 0) -> ndarray:

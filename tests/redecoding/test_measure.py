@@ -19,8 +19,6 @@ from sl_nerfstudio.redecoding.measure import (
 from tests.redecoding.lit_ball import grid
 
 RNG = np.random.default_rng(1)
-
-
 DOTS = gaussian_filter(RNG.random((120, 140)).astype(np.float32), 2.0)
 
 
@@ -41,15 +39,17 @@ def test_a_grid_resembles_itself_at_whole_periods():
     assert np.linalg.norm(found.decoys, axis=1).min() > np.linalg.norm(found.rivals, axis=1).max()
 
 
-def test_random_dots_resemble_themselves_nowhere():
-    found = Ambiguity.of(DOTS)
-    assert len(found.rivals) == 0 and len(found.decoys) == 8 and found.pitch > 8
+def test_dots_resemble_themselves_nowhere_and_flat_or_striped_patterns_are_no_special_case():
+    dots = Ambiguity.of(DOTS)
+    assert len(dots.rivals) == 0 and len(dots.decoys) == 8 and dots.pitch > 8
+    for pattern in (np.full((60, 80), 0.3), np.arange(80.0) // 8 % 2 + np.zeros((60, 1))):
+        found = Ambiguity.of(pattern.astype(np.float32))
+        assert 1 < found.pitch < 20 and len(found.rivals) <= 24 and 1 <= len(found.decoys) <= 8
 
 
-@pytest.mark.parametrize("pattern", [np.full((60, 80), 0.3), np.arange(80.0) // 8 % 2 + np.zeros((60, 1))])
-def test_a_flat_or_a_striped_pattern_is_no_special_case(pattern):
-    found = Ambiguity.of(pattern.astype(np.float32))
-    assert 1 < found.pitch < 20 and len(found.rivals) <= 24 and 1 <= len(found.decoys) <= 8
+def fit(image, *places, depth=None):
+    start = np.zeros((len(places), 2), dtype=np.float32)
+    return fit_shifts(flat_view(image, depth), DOTS, np.array(places), start, CorrelationWindow.gaussian(5.0))
 
 
 def test_correlation_is_that_of_numpy_whatever_the_gain():
@@ -67,15 +67,18 @@ def test_correlation_is_that_of_numpy_whatever_the_gain():
             assert found[n, k] == pytest.approx(C[0, 1] / np.sqrt(C[0, 0] * C[1, 1]), abs=1e-3)
 
 
-def test_a_displacement_is_found_to_a_hundredth_of_a_pixel():
+def test_a_displacement_is_found_to_a_hundredth_of_a_pixel_but_none_in_a_blank_image():
     image = 0.1 + 0.3 * shift(DOTS, (-0.37, 0.81), order=3)
     places = np.argwhere(np.pad(np.ones((60, 60), dtype=bool), 30)[:120, :140])[::37]
-    fit = fit_shifts(
-        flat_view(image), DOTS, places, np.zeros((len(places), 2), dtype=np.float32), CorrelationWindow.gaussian(5.0)
-    )
-    np.testing.assert_allclose(np.median(fit.shift, 0), [-0.81, 0.37], atol=0.02)
-    assert np.abs(fit.shift - [-0.81, 0.37]).max() < 0.15 and fit.correlation.min() > 0.99
-    assert fit.covered.min() == pytest.approx(1, abs=1e-5) and fit.step.max() < 0.05
+    found = fit(image, *places)
+    np.testing.assert_allclose(np.median(found.shift, 0), [-0.81, 0.37], atol=0.02)
+    assert np.abs(found.shift - [-0.81, 0.37]).max() < 0.15 and found.correlation.min() > 0.99
+    assert found.covered.min() == pytest.approx(1, abs=1e-5) and found.step.max() < 0.05
+    blank = np.full_like(DOTS, 0.4)
+    nothing = fit(blank, (60, 60))
+    assert nothing.correlation[0] == 0 and nothing.sigma[0] == np.inf
+    places, window = np.array([[60, 60]]), CorrelationWindow.gaussian(5.0)
+    assert correlations(flat_view(blank), DOTS[..., None], places, window).item() == 0
 
 
 def test_a_window_stays_on_its_surface():
@@ -84,26 +87,8 @@ def test_a_window_stays_on_its_surface():
     depth[:, 70:] = 100.0
     image = DOTS.copy()
     image[:, 70:] = RNG.random((120, 70))
-    fit = fit_shifts(
-        flat_view(image, depth),
-        DOTS,
-        np.array([[60, 67]]),
-        np.zeros((1, 2), np.float32),
-        CorrelationWindow.gaussian(5.0),
-    )
-    assert fit.correlation[0] > 0.999 and np.abs(fit.shift).max() < 0.01 and 0.5 < fit.covered[0] < 0.9
-
-
-def test_a_blank_image_has_no_place():
-    blank = np.full_like(DOTS, 0.4)
-    fit = fit_shifts(
-        flat_view(blank), DOTS, np.array([[60, 60]]), np.zeros((1, 2), np.float32), CorrelationWindow.gaussian(5.0)
-    )
-    assert fit.correlation[0] == 0 and fit.sigma[0] == np.inf
-    assert (
-        correlations(flat_view(blank), DOTS[..., None], np.array([[60, 60]]), CorrelationWindow.gaussian(5.0)).item()
-        == 0
-    )
+    found = fit(image, (60, 67), depth=depth)
+    assert found.correlation[0] > 0.999 and np.abs(found.shift).max() < 0.01 and 0.5 < found.covered[0] < 0.9
 
 
 LEARNT = np.random.default_rng(0)
@@ -113,7 +98,7 @@ def made_up(correlation: np.ndarray, margin: np.ndarray) -> Measured:
     n = len(correlation)
     zero = np.zeros(n, dtype=np.float32)
     return Measured(
-        places=np.zeros((n, 2), dtype=np.int64), coords=np.zeros((n, 2), dtype=np.float32), along=zero, across=zero,
+        places=np.zeros((n, 2), dtype=np.int64), coords=np.zeros((n, 2), dtype=np.float32), across=zero,
         correlation=correlation.astype(np.float32), margin=margin.astype(np.float32), roughness=zero,
         covered=zero + 1, step=zero, sigma=zero + 0.01,
     )  # fmt: skip
@@ -144,12 +129,9 @@ def test_where_few_are_right_chance_is_bounded():
     assert accepted[1200:].sum() <= max(3 * FALSE * accepted[~known].sum(), 2)
 
 
-def test_an_image_that_shows_nothing_teaches_nothing():
-    everywhere = np.ones(1000, dtype=bool)
-    assert learn(sampled(1000, 0.7, 0.0), everywhere, ~everywhere, 1000, WRONG, 20.0) is None
-
-
-@pytest.mark.parametrize(("right", "decoded"), [(150, 150), (400, 1000)])
-def test_too_few_right_ones_teach_nothing(right, decoded):
+@pytest.mark.parametrize(
+    ("right", "decoded", "correlation", "margin"), [(150, 150, 0.95, 0.2), (400, 1000, 0.95, 0.2), (1000, 1000, 0.7, 0)]
+)
+def test_too_few_right_ones_or_an_image_that_shows_nothing_teach_nothing(right, decoded, correlation, margin):
     chosen = np.arange(1000) < right
-    assert learn(sampled(1000, 0.95, 0.2), chosen, ~chosen, decoded, WRONG, 20.0) is None
+    assert learn(sampled(1000, correlation, margin), chosen, ~chosen, decoded, WRONG, 20.0) is None
