@@ -138,7 +138,6 @@ def at(*pixel):
 
 
 OTHER = at(30.0, 30.0)
-OUTSIDE = f"has the pixel (30, 61), outside the {CAMERA.w} x {CAMERA.h} pixels of frame {NAMES[1]!r}"
 
 
 def bar(other=OTHER, length=5.0):
