@@ -276,3 +276,7 @@ def _print_summary(config: CalibrateConfig, found: "BoardCalibration", verdict: 
 def main() -> None:
     """Entry point of the command."""
     run(lambda: calibrate_devices(parse(CalibrateConfig, "sl-calibrate", _INPUTS, _GROUPS)))
+
+
+if __name__ == "__main__":
+    main()

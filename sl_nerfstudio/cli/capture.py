@@ -340,3 +340,7 @@ def main() -> None:
     """Entry point of the command."""
     inputs = {"pattern": "give the pattern.json that sl-pattern wrote"}
     run(lambda: capture(parse(CaptureConfig, "sl-capture", inputs, _GROUPS)))
+
+
+if __name__ == "__main__":
+    main()

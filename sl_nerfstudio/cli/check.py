@@ -190,3 +190,7 @@ def summary(result: "FolderCheck") -> str:
     if whole:
         lines.append(f"  note                the mask covers the whole image in {', '.join(whole)}")
     return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()

@@ -514,3 +514,7 @@ def _check(config: EvalConfig) -> None:
 def main() -> None:
     """Entry point of `sl-eval`."""
     run(lambda: evaluate_scan(parse(EvalConfig, "sl-eval", _INPUTS, _GROUPS)))
+
+
+if __name__ == "__main__":
+    main()

@@ -504,3 +504,7 @@ def export_trained(trained: "TrainedRun", config: ExportConfig) -> "Exported":
                 f"{path}: is the scan's own file\n    remedy: give --poses another folder, such as refined/"
             )
     return export_run(trained, config.settings(scan.units))
+
+
+if __name__ == "__main__":
+    main()

@@ -355,3 +355,7 @@ def _check(arguments: PatternArguments) -> None:
         raise UserError(f"--seed {arguments.seed}: seeds are at least 0")
     if arguments.print_width is not None and not 0 < arguments.print_width < float("inf"):
         raise UserError(f"--print-width {arguments.print_width:g}: give a width in millimetres above 0")
+
+
+if __name__ == "__main__":
+    main()

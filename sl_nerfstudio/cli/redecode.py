@@ -94,3 +94,7 @@ def _left(frames: "list[RedecodedFacts]") -> list[str]:
         "    At too few of their decoded pixels, the image shows the pattern where surface and poses predict it.",
         "    The image is too coarse or does not show this pattern, or the frame's poses are wrong.",
     ]
+
+
+if __name__ == "__main__":
+    main()

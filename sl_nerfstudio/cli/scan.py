@@ -486,3 +486,7 @@ def _main() -> None:
 def main() -> None:
     """Entry point of the command."""
     run(_main)
+
+
+if __name__ == "__main__":
+    main()

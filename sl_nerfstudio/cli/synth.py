@@ -74,3 +74,7 @@ def _next(output: Path, config: SynthConfig) -> str:
         )
     files = ("--images", output / "images", "--pattern", pattern)
     return next_steps([command("sl-process", *files, "--intrinsics", output / "intrinsics.json", "--output", "scan")])
+
+
+if __name__ == "__main__":
+    main()
