@@ -11,7 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from sl_nerfstudio.calibration.formats import read_device_file
 from sl_nerfstudio.cli import check, process
+from sl_nerfstudio.errors import UserError
 from tests.cli.snapshots import Ended, call
 
 REAL_DATA = Path(os.environ.get("SL_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -62,10 +64,26 @@ CASES = (
 )  # fmt: skip
 
 
+def folder_of(name: str) -> Path:
+    if not (FOLDER / name).exists():
+        pytest.skip(f"the files of this case were not found: {FOLDER / name} (set SL_CASES to their folder)")
+    return FOLDER / name
+
+
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.name}-{case.words[1].split('/')[-1]}")
 def test_a_case(case: Case, tmp_path: Path) -> None:
-    folder = FOLDER / case.name
-    if not folder.exists():
-        pytest.skip(f"the files of this case were not found: {folder} (set SL_CASES to their folder)")
+    folder = folder_of(case.name)
     words = [word.format(case=folder, out=tmp_path) for word in case.words]
     case.ends(call(case.main, *words))
+
+
+@pytest.mark.parametrize(("role", "term"), [("camera", "k6 = -50.8"), ("projector", "k6 = -29.1")])
+def test_of_fourteen_lens_terms_those_that_are_zero_are_passed_over_and_others_named(role: str, term: str) -> None:
+    folder, size = folder_of("opencv_14_terms"), (1136, 1046)
+    camera, projector = (read_device_file(folder / "stereo14_zero.yml", one, size) for one in ("camera", "projector"))
+    assert (camera.fl_x, camera.cx) == (3173.5470908336333, 568.0544331842342 + 0.5)
+    assert (camera.k1, camera.k2, camera.p1) == (-0.18827534553754133, 2.7711625543207616, 0)
+    assert (projector.cx, projector.k1) == pytest.approx((567.17323067777738 + 0.5, -0.24851802551104779), abs=1e-6)
+    said = rf"stereo\.yml: {role}: the lens model has terms beyond .*\({term}\)(.|\n)*CALIB_RATIONAL_MODEL"
+    with pytest.raises(UserError, match=said):
+        read_device_file(folder / "stereo.yml", role, size)
