@@ -105,17 +105,23 @@ class GeometricFit:
         return float(np.median(excess)) if len(excess) else np.nan
 
 
-def fit_geometry(frames: Sequence[Correspondences], projector: Device) -> GeometricFit:
-    """Triangulate all frames; measure how well rays meet and how well frames agree."""
-    camera = Intrinsics.of([f.camera for f in frames], torch.float64).reshape(-1, 1)
-    geometry = (
-        camera,
+def geometry_of(
+    frames: Sequence[Correspondences], projector: Device
+) -> tuple[Intrinsics, Tensor, Tensor, Intrinsics, Tensor, Tensor]:
+    """Devices, poses and pixels as `triangulate` takes them, [frames, points]."""
+    return (
+        Intrinsics.of([f.camera for f in frames], torch.float64).reshape(-1, 1),
         _stack(f.T_world_camera for f in frames)[:, None],
         _stack(f.uv_camera for f in frames),
         Intrinsics.of(projector, torch.float64),
         _stack(f.T_world_projector for f in frames)[:, None],
         _stack(f.uv_projector for f in frames),
     )
+
+
+def fit_geometry(frames: Sequence[Correspondences], projector: Device) -> GeometricFit:
+    """Triangulate all frames; measure how well rays meet and how well frames agree."""
+    geometry = geometry_of(frames, projector)
     residual = epipolar_residual(*geometry).abs().nan_to_num(nan=torch.inf)
     in_front = residual.isfinite()
     points = triangulate(*geometry)
