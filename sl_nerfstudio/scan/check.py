@@ -250,7 +250,7 @@ def check_content(
         if inside.size and inside.min() == inside.max():
             files.add(_nothing_in_it("the image, where the mask is"), shown_key)
     shift = match = image_match = None
-    if coords is not None and both is not None and shown is not None and pattern is not None:
+    if coords is not None and both is not None and where is not None and shown is not None and pattern is not None:
         grey = as_grey(shown)
         shift = pattern_shift(coords, both, grey, pattern.grey)
         if pattern.detailed:

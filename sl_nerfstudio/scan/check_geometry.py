@@ -65,7 +65,7 @@ class OtherClouds:
         own = self._sizes[index]
         if len(cloud) < _FEWEST_POINTS or self._tree.n - own < _FEWEST_POINTS:
             return np.inf
-        distances, points = self._tree.query(cloud, k=range(1, own + 2))  # not all of these are of cloud `index`
+        distances, points = self._tree.query(cloud, k=own + 2)  # not all of these are of cloud `index`
         first = (self._number[points] != index).argmax(1)
         return float(np.median(distances[np.arange(len(cloud)), first]))
 

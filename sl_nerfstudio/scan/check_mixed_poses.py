@@ -193,17 +193,21 @@ def _worlds(frames: Sequence[Correspondences], projector: Device) -> Iterator[_M
         for f in frames[:: max(1, len(frames) // _MOST_FRAMES)]
     ]
     kernel_px = _KERNEL * (projector.fl_x + projector.fl_y) / 2
+    camera, _, uv, intrinsics, T_world_projector, uv_projector = geometry_of(some, projector)
+    T_world_camera = _stacked(some, "camera")
 
     def residuals(S: Similarity) -> Float64[ndarray, "m"]:
         """Bounded: those far beyond the kernel, and rays that meet behind a device, count alike."""
-        px = epipolar_residual(*geometry_of(_moved(some, S), projector))
+        T = torch.from_numpy(S.poses(T_world_camera))[:, None]
+        px = epipolar_residual(camera, T, uv, intrinsics, T_world_projector, uv_projector)
         return np.arctan(px.nan_to_num(nan=torch.inf).flatten().numpy() / kernel_px) * kernel_px
 
     def cost(S: Similarity) -> float:
         return float((residuals(S) ** 2).sum() / 2)
 
     starts = sorted(_starts(frames), key=cost)[:_MOST_STARTS]
-    S = min((_nearest_minimum(start, some, residuals, cost) for start in starts), key=cost)
+    positions = T_world_camera[:, :3, 3]
+    S = min((_nearest_minimum(start, positions, residuals, cost) for start in starts), key=cost)
     yield _Mistake(
         _moved(frames, S),
         _KEYS["camera"],
@@ -243,12 +247,12 @@ def _starts(frames: Sequence[Correspondences]) -> Iterator[Similarity]:
 
 def _nearest_minimum(
     start: Similarity,
-    frames: Sequence[Correspondences],
+    positions: Float64[ndarray, "n 3"],
     residuals: Callable[[Similarity], Float64[ndarray, "m"]],
     cost: Callable[[Similarity], float],
 ) -> Similarity:
-    """The motion of all cameras that a search from `start` ends in."""
-    centres = start.points(_stacked(frames, "camera")[:, :3, 3])
+    """The motion of all cameras, at these positions, that a search from `start` ends in."""
+    centres = start.points(positions)
     middle = centres.mean(0)
     size = max(float(np.linalg.norm(centres - middle, axis=1).max()), 1e-300)
 
