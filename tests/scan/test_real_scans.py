@@ -6,7 +6,6 @@ import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from sphere_scan import edit
 from test_check_conventions import disturbed, undo
