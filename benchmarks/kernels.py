@@ -95,8 +95,7 @@ def launches_of_a_step(method: str, scan: Path) -> list[Launch]:
             torch.stack(list(terms.values())).sum().backward()
         training.model.cache.refresh(training.model.field)
         state = {"moments": torch.zeros(len(table), 2, 8), "steps": torch.zeros(len(table))}
-        first, second = RowAdam([table]).param_groups[0]["betas"]
-        _step_device(table, state, 0.01, first, second, 1e-15)
+        _step_device(table, state, 0.01, RowAdam([table]).param_groups[0]["betas"], 1e-15)
     return found
 
 

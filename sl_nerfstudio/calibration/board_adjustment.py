@@ -117,16 +117,6 @@ class CornerSightings:
     uv: Float64[ndarray, "n 2"]
 
 
-@dataclass(frozen=True)
-class Linearised:
-    """Residuals of the corners in one device, and how the predictions change, in pixels."""
-
-    residual: Float64[ndarray, "n 2"]  # seen minus predicted
-    by_intrinsics: Float64[ndarray, "n 2 k"]  # for each fitted number
-    by_rig: Float64[ndarray, "n 2 6"]  # for a twist (v, w) of T_projector_camera, from the left; 0 in the camera
-    by_board: Float64[ndarray, "n 2 6"]  # for a twist of the view's T_camera_board, from the left
-
-
 def sightings(views: Sequence[BoardView], p_board: Float64[ndarray, "m 3"]) -> tuple[CornerSightings, ...]:
     """The corners that the camera sees, and those of the projector if it sees any."""
     seen = [[(k, view.camera) for k, view in enumerate(views)],
@@ -149,21 +139,20 @@ def residuals(rig: BoardRig, device: int, seen: CornerSightings) -> Float64[ndar
     return np.where(in_front.numpy()[:, None], seen.uv - uv.numpy(), _BEHIND_PX)
 
 
-def linearised(rig: BoardRig, device: int, free: FreeIntrinsics, seen: CornerSightings) -> Linearised:
-    """Residuals with the derivatives of the predictions."""
+def derivatives(
+    rig: BoardRig, device: int, free: FreeIntrinsics, seen: CornerSightings
+) -> tuple[Float64[ndarray, "n 2 k"], Float64[ndarray, "n 2 6"], Float64[ndarray, "n 2 6"]]:
+    """Derivatives of the predicted pixels by the fitted intrinsics, and by twists (v, w) from the left.
+
+    The twists are those of T_projector_camera, by which the camera's pixels do not change, and of the view's board.
+    """
     p_camera, p_device = _in_device(rig, device, seen)
     p = torch.from_numpy(p_device)
-    intrinsics = Intrinsics.of(rig.devices[device], torch.float64)
-    uv, in_front = project(intrinsics, p)
-    by_point = project_jacobian(intrinsics, p).numpy()
+    by_point = project_jacobian(Intrinsics.of(rig.devices[device], torch.float64), p).numpy()
     R = rig.T_projector_camera[:3, :3] if device else np.eye(3)
     by_board = by_point @ R @ _by_twist(p_camera)
-    return Linearised(
-        np.where(in_front.numpy()[:, None], seen.uv - uv.numpy(), _BEHIND_PX),
-        _by_parameters(rig.devices[device], p) @ free.columns(),
-        by_point @ _by_twist(p_device) if device else np.zeros_like(by_board),
-        by_board,
-    )
+    by_rig = by_point @ _by_twist(p_device) if device else np.zeros_like(by_board)
+    return _by_parameters(rig.devices[device], p) @ free.columns(), by_rig, by_board
 
 
 def _in_device(
@@ -274,14 +263,15 @@ def normal_equations(rig: BoardRig, free: Free, seen: Seen, sigma: Sigma) -> Blo
     size, boards = int(begin[-1]) + (6 if len(free) == 2 else 0), len(rig.T_camera_board)
     products = np.zeros((boards, size + 7, size + 7))  # of all columns: shared, of the board, residual
     for k, of_device in enumerate(seen):
-        one = linearised(rig, k, free[k], of_device)
-        weights = kernel(one.residual / sigma[k])[1]
+        residual = residuals(rig, k, of_device)
+        by_intrinsics, by_rig, by_board = derivatives(rig, k, free[k], of_device)
+        weights = kernel(residual / sigma[k])[1]
         rows = np.zeros((len(weights), 2, size + 7))
-        rows[..., begin[k] : begin[k + 1]] = one.by_intrinsics
+        rows[..., begin[k] : begin[k + 1]] = by_intrinsics
         if k:
-            rows[..., size - 6 : size] = one.by_rig
-        rows[..., size : size + 6] = one.by_board
-        rows[..., -1] = one.residual
+            rows[..., size - 6 : size] = by_rig
+        rows[..., size : size + 6] = by_board
+        rows[..., -1] = residual
         rows *= (np.sqrt(weights) / sigma[k])[:, None, None]
         ends = np.searchsorted(of_device.view, np.arange(boards + 1))  # corners are ordered by view
         for b in range(boards):

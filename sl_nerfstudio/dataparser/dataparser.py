@@ -71,8 +71,6 @@ def _mix(key: UInt64[ndarray, "..."]) -> UInt64[ndarray, "..."]:
 
 # Which scan a run was trained on: a hash that its config.yml and its checkpoints carry.
 
-_CHUNK = 1 << 20  # bytes
-
 
 def scan_fingerprint(scan: Scan) -> str:
     """SHA-256 (hexadecimal) of transforms.json and of every frame's coordinates and mask, in the order of the frames.
@@ -82,21 +80,14 @@ def scan_fingerprint(scan: Scan) -> str:
     whole = hashlib.sha256()
     paths = [path for frame in scan.frames for path in (*frame.coords_paths, frame.mask_path) if path is not None]
     for path in (scan.root / TRANSFORMS, *paths):
-        whole.update(_file_hash(path))
+        try:
+            content = path.read_bytes()
+        except OSError as error:
+            raise FileError(
+                path, f"cannot be read ({error.strerror})", "it was removed meanwhile", "restore the file"
+            ) from error
+        whole.update(hashlib.sha256(content).digest())
     return whole.hexdigest()
-
-
-def _file_hash(path: Path) -> bytes:
-    found = hashlib.sha256()
-    try:
-        with path.open("rb") as stream:
-            while chunk := stream.read(_CHUNK):
-                found.update(chunk)
-    except OSError as error:
-        raise FileError(
-            path, f"cannot be read ({error.strerror})", "it was removed meanwhile", "restore the file"
-        ) from error
-    return found.digest()
 
 
 def require_same_scan(root: Path, actual: str, stated: str | None, of_what: str) -> None:

@@ -42,7 +42,8 @@ class RowAdam(Optimizer):
         for group in self.param_groups:
             for parameter in group["params"]:
                 if parameter.grad is not None:
-                    self._step(parameter, group["lr"], group["betas"], group["eps"])
+                    beta1, beta2 = group["betas"]  # a list, perhaps, if a file was read
+                    self._step(parameter, group["lr"], (beta1, beta2), group["eps"])
         return loss
 
     def state_dict(self) -> dict[str, Any]:  # pyright: ignore

@@ -4,14 +4,12 @@ In: a folder with transforms.json, or frames one by one. Out: a `Scan` with its 
 faults; or a folder on disk.
 """
 
-from sl_nerfstudio.errors import Fault, ScanError
+from sl_nerfstudio.errors import ScanError
 from sl_nerfstudio.scan.check import check_scan, require_valid
 from sl_nerfstudio.scan.document import FileError
 from sl_nerfstudio.scan.read import read_scan
 from sl_nerfstudio.scan.types import (
-    UNITS,
     Frame,
-    GroundTruth,
     PickedPixel,
     PoseSigma,
     Scale,
@@ -30,11 +28,8 @@ from sl_nerfstudio.scan.write import (
 )
 
 __all__ = [
-    "UNITS",
-    "Fault",
     "FileError",
     "Frame",
-    "GroundTruth",
     "PickedPixel",
     "PoseSigma",
     "Scale",

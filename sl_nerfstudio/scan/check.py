@@ -232,7 +232,7 @@ def check_content(
     decoded = None if coords is None else np.isfinite(coords[..., 0])  # and so is the other, or it would be a fault
     where = decoded if mask is None else mask
     both = decoded if decoded is None or mask is None else decoded & mask
-    if mask is not None and decoded is not None and decoded.any() and both is not None and not both.any():
+    if mask is not None and decoded is not None and decoded.any() and not (decoded & mask).any():
         files.add(
             Problem(
                 "excludes every pixel that has coordinates",
@@ -440,7 +440,7 @@ def check_folder(root: Path) -> FolderCheck:
     for name, duplicate in duplicate_problems(contents):
         faults.add(duplicate, TRANSFORMS, name)
     for problem in shift_problems([content.shift for content in contents]):
-        faults.add(problem, TRANSFORMS, None, _coords_key(frames))
+        faults.add(problem, TRANSFORMS, None, frames[0].coords_key)
     _check_conventions(partial, contents, faults)
     _check_images(frames, contents, good, faults)
     found = faults.found
@@ -491,12 +491,7 @@ def _check_conventions(partial: PartialScan, contents: list[FrameContent], fault
     with np.errstate(all="ignore"):
         for frame, key, problem in convention_problems(frames, partial.projector, metres):
             where = [one for one in partial.frames if frame in (None, one.name)]
-            faults.add(problem, TRANSFORMS, frame, _coords_key(where) if key in COORDS_KEYS else key)
-
-
-def _coords_key(frames: Sequence[PartialFrame]) -> str:
-    """The key at which frames name their coordinates; of the first of them if they differ."""
-    return frames[0].coords_key
+            faults.add(problem, TRANSFORMS, frame, where[0].coords_key if key in COORDS_KEYS else key)
 
 
 def _check_images(

@@ -43,37 +43,31 @@ def sample_pixels(
     return np.stack([columns, rows], -1) + 0.5, coords.reshape(-1, 2)[chosen].astype(np.float64)
 
 
-# How far a frame's points are from those of all other frames, without a search tree for every frame.
+# How far a frame's points are from those of all other frames, in one search tree.
 
 _FEWEST_POINTS = 10
 
 
 class OtherClouds:
-    """Point clouds of frames, to be searched without the cloud of one frame.
-
-    Two numbers differ in at least one binary digit. So the clouds whose number differs from k are those that differ
-    in the first digit, in the second, and so on: two trees for each digit serve all frames.
-    """
+    """Point clouds of frames, to be searched without the cloud of one frame."""
 
     def __init__(self, clouds: Sequence[Float64[ndarray, "_ 3"]]) -> None:
         """`clouds` are numbered in their order."""
-        points = np.concatenate([np.empty((0, 3)), *clouds])
-        number = np.repeat(np.arange(len(clouds)), [len(cloud) for cloud in clouds])
         self._sizes = [len(cloud) for cloud in clouds]
-        self._total = len(points)
-        digits = range(max(1, (len(clouds) - 1).bit_length()))
-        self._trees = [[KDTree(points[number >> digit & 1 == value]) for value in (0, 1)] for digit in digits]
+        self._number = np.repeat(np.arange(len(clouds)), self._sizes)
+        self._tree = KDTree(np.concatenate([np.empty((0, 3)), *clouds]))
 
     def distance(self, cloud: Float64[ndarray, "n 3"], index: int) -> float:
         """Median distance from the points of `cloud` to the nearest one of any cloud but number `index`.
 
         Infinite where either side has too few points.
         """
-        if len(cloud) < _FEWEST_POINTS or self._total - self._sizes[index] < _FEWEST_POINTS:
+        own = self._sizes[index]
+        if len(cloud) < _FEWEST_POINTS or self._tree.n - own < _FEWEST_POINTS:
             return np.inf
-        trees = [pair[1 - (index >> digit & 1)] for digit, pair in enumerate(self._trees)]
-        nearest = np.min([tree.query(cloud)[0] for tree in trees if tree.n], axis=0)
-        return float(np.median(nearest))
+        distances, points = self._tree.query(cloud, k=own + 2)  # not all of these are of cloud `index`
+        first = (self._number[points] != index).argmax(1)
+        return float(np.median(distances[np.arange(len(cloud)), first]))
 
 
 # Rays and surfaces under the poses of a scan.
@@ -111,17 +105,23 @@ class GeometricFit:
         return float(np.median(excess)) if len(excess) else np.nan
 
 
-def fit_geometry(frames: Sequence[Correspondences], projector: Device) -> GeometricFit:
-    """Triangulate all frames; measure how well rays meet and how well frames agree."""
-    camera = Intrinsics.of([f.camera for f in frames], torch.float64).reshape(-1, 1)
-    geometry = (
-        camera,
+def geometry_of(
+    frames: Sequence[Correspondences], projector: Device
+) -> tuple[Intrinsics, Tensor, Tensor, Intrinsics, Tensor, Tensor]:
+    """Devices, poses and pixels as `triangulate` takes them, [frames, points]."""
+    return (
+        Intrinsics.of([f.camera for f in frames], torch.float64).reshape(-1, 1),
         _stack(f.T_world_camera for f in frames)[:, None],
         _stack(f.uv_camera for f in frames),
         Intrinsics.of(projector, torch.float64),
         _stack(f.T_world_projector for f in frames)[:, None],
         _stack(f.uv_projector for f in frames),
     )
+
+
+def fit_geometry(frames: Sequence[Correspondences], projector: Device) -> GeometricFit:
+    """Triangulate all frames; measure how well rays meet and how well frames agree."""
+    geometry = geometry_of(frames, projector)
     residual = epipolar_residual(*geometry).abs().nan_to_num(nan=torch.inf)
     in_front = residual.isfinite()
     points = triangulate(*geometry)

@@ -5,7 +5,7 @@ projectors that come from two programs, or from two lists, are each right and do
 mistake must bring the rays of nearly all frames together, as far as the scan states its uncertainty.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics
+from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.least_squares import NormalEquations, minimise
 from sl_nerfstudio.geometry.lie import (
     AXIS_TURNS,
@@ -27,7 +27,7 @@ from sl_nerfstudio.geometry.lie import (
     fit_similarity,
 )
 from sl_nerfstudio.geometry.triangulation import epipolar_residual
-from sl_nerfstudio.scan.check_geometry import Correspondences, GeometricFit, fit_geometry
+from sl_nerfstudio.scan.check_geometry import Correspondences, GeometricFit, fit_geometry, geometry_of
 from sl_nerfstudio.scan.document import Problem
 
 # Epipolar residuals as fractions of the projector's focal length: angles in radians.
@@ -187,9 +187,27 @@ _STEP = 1e-6  # radian, and of the cameras' distances: for derivatives
 
 def _worlds(frames: Sequence[Correspondences], projector: Device) -> Iterator[_Mistake]:
     """The camera poses turned, scaled and shifted together against the projector poses."""
-    motions = _Motions.of(frames, projector)
-    starts = sorted(_starts(frames), key=motions.cost)[:_MOST_STARTS]
-    S = min((motions.best(start) for start in starts), key=motions.cost)
+    step = max(1, len(frames[0].uv_camera) // _POINTS)
+    some = [
+        replace(f, uv_camera=f.uv_camera[::step], uv_projector=f.uv_projector[::step])
+        for f in frames[:: max(1, len(frames) // _MOST_FRAMES)]
+    ]
+    kernel_px = _KERNEL * (projector.fl_x + projector.fl_y) / 2
+    camera, _, uv, intrinsics, T_world_projector, uv_projector = geometry_of(some, projector)
+    T_world_camera = _stacked(some, "camera")
+
+    def residuals(S: Similarity) -> Float64[ndarray, "m"]:
+        """Bounded: those far beyond the kernel, and rays that meet behind a device, count alike."""
+        T = torch.from_numpy(S.poses(T_world_camera))[:, None]
+        px = epipolar_residual(camera, T, uv, intrinsics, T_world_projector, uv_projector)
+        return np.arctan(px.nan_to_num(nan=torch.inf).flatten().numpy() / kernel_px) * kernel_px
+
+    def cost(S: Similarity) -> float:
+        return float((residuals(S) ** 2).sum() / 2)
+
+    starts = sorted(_starts(frames), key=cost)[:_MOST_STARTS]
+    positions = T_world_camera[:, :3, 3]
+    S = min((_nearest_minimum(start, positions, residuals, cost) for start in starts), key=cost)
     yield _Mistake(
         _moved(frames, S),
         _KEYS["camera"],
@@ -227,60 +245,25 @@ def _starts(frames: Sequence[Correspondences]) -> Iterator[Similarity]:
     yield Similarity(scale, R, middles[1] - scale * R @ middles[0])
 
 
-@dataclass(frozen=True)
-class _Motions:
-    """Epipolar residuals of some correspondences while all cameras move together."""
+def _nearest_minimum(
+    start: Similarity,
+    positions: Float64[ndarray, "n 3"],
+    residuals: Callable[[Similarity], Float64[ndarray, "m"]],
+    cost: Callable[[Similarity], float],
+) -> Similarity:
+    """The motion of all cameras, at these positions, that a search from `start` ends in."""
+    centres = start.points(positions)
+    middle = centres.mean(0)
+    size = max(float(np.linalg.norm(centres - middle, axis=1).max()), 1e-300)
 
-    camera: Intrinsics
-    projector: Intrinsics
-    T_world_camera: Float64[ndarray, "n 4 4"]
-    T_world_projector: torch.Tensor
-    uv_camera: torch.Tensor
-    uv_projector: torch.Tensor
-    kernel_px: float
+    def moved(S: Similarity, x: Float64[ndarray, "7"]) -> Similarity:
+        R = exp_so3(torch.from_numpy(x[:3].copy())).numpy()
+        scale = float(np.exp(x[6]))
+        return Similarity(scale, R, middle + size * x[3:6] - scale * R @ middle) @ S
 
-    @staticmethod
-    def of(frames: Sequence[Correspondences], projector: Device) -> "_Motions":
-        """Choose a limited number of frames and points, spread over all."""
-        some = frames[:: max(1, len(frames) // _MOST_FRAMES)]
-        step = max(1, len(some[0].uv_camera) // _POINTS)
-        tensor = torch.from_numpy
-        return _Motions(
-            Intrinsics.of([f.camera for f in some], torch.float64).reshape(-1, 1),
-            Intrinsics.of(projector, torch.float64),
-            _stacked(some, "camera"),
-            tensor(_stacked(some, "projector"))[:, None],
-            tensor(np.stack([f.uv_camera[::step] for f in some])),
-            tensor(np.stack([f.uv_projector[::step] for f in some])),
-            _KERNEL * (projector.fl_x + projector.fl_y) / 2,
-        )
+    def equations(S: Similarity) -> NormalEquations:
+        steps = _STEP * np.eye(7)
+        J = np.stack([(residuals(moved(S, x)) - residuals(moved(S, -x))) / (2 * _STEP) for x in steps], 1)
+        return NormalEquations.of(J, residuals(S))
 
-    def residuals(self, S: Similarity) -> Float64[ndarray, "m"]:
-        """Bounded residuals: those far beyond the kernel, and rays that meet behind a device, count alike."""
-        T = torch.from_numpy(S.poses(self.T_world_camera))[:, None]
-        px = epipolar_residual(
-            self.camera, T, self.uv_camera, self.projector, self.T_world_projector, self.uv_projector
-        )
-        return np.arctan(px.nan_to_num(nan=torch.inf).flatten().numpy() / self.kernel_px) * self.kernel_px
-
-    def cost(self, S: Similarity) -> float:
-        """Half the squared residuals."""
-        return float((self.residuals(S) ** 2).sum() / 2)
-
-    def best(self, start: Similarity) -> Similarity:
-        """The nearest minimum."""
-        centres = start.points(self.T_world_camera[:, :3, 3])
-        middle = centres.mean(0)
-        size = max(float(np.linalg.norm(centres - middle, axis=1).max()), 1e-300)
-
-        def moved(S: Similarity, x: Float64[ndarray, "7"]) -> Similarity:
-            R = exp_so3(torch.from_numpy(x[:3].copy())).numpy()
-            scale = float(np.exp(x[6]))
-            return Similarity(scale, R, middle + size * x[3:6] - scale * R @ middle) @ S
-
-        def equations(S: Similarity) -> NormalEquations:
-            steps = _STEP * np.eye(7)
-            J = np.stack([(self.residuals(moved(S, x)) - self.residuals(moved(S, -x))) / (2 * _STEP) for x in steps], 1)
-            return NormalEquations.of(J, self.residuals(S))
-
-        return minimise(start, equations, moved, self.cost, iterations=40, tolerance=1e-6).state
+    return minimise(start, equations, moved, cost, iterations=40, tolerance=1e-6).state

@@ -161,9 +161,8 @@ class PartialFrame:
         return CoordinateFiles(paths, self.coords_units, (projector.w, projector.h))
 
     def complete(self, projector: Device) -> Frame:
-        """The frame, if no fault was found. Raises ValueError if a value is missing."""
-        if self.camera is None or self.T_world_camera is None or self.T_world_projector is None:
-            raise ValueError(f"frame {self.name} has faults")
+        """The frame, if no fault was found."""
+        assert self.camera is not None and self.T_world_camera is not None and self.T_world_projector is not None
         image, poses = self.paths["file_path"], (self.T_world_camera, self.T_world_projector)
         pattern, mask, color = map(self.paths.get, PICTURES[1:])
         coords = self.coords_files(projector)
@@ -292,9 +291,9 @@ class PartialScan:
     shrunk_by: int = 1
 
     def complete(self) -> Scan:
-        """The scan, if no fault was found. Raises ValueError if a value is missing."""
-        if self.units is None or self.scale is None or self.projector is None or self.pattern_path is None:
-            raise ValueError("a scan with faults cannot be completed")
+        """The scan, if no fault was found."""
+        assert self.units is not None and self.scale is not None
+        assert self.projector is not None and self.pattern_path is not None
         frames, shrunk_by = tuple(frame.complete(self.projector) for frame in self.frames), self.shrunk_by
         return Scan(self.root, self.units, self.scale, self.projector, self.pattern_path, frames, shrunk_by=shrunk_by)
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from sl_nerfstudio.calibration.formats import read_device_file, read_entries, reduce_distortion
+from sl_nerfstudio.calibration.formats import read_device_file, reduce_distortion
 from sl_nerfstudio.calibration.stated import CERTAIN, read_stated_sigma
 from sl_nerfstudio.calibration.stored_values import read_stored_values
 from sl_nerfstudio.errors import UserError
@@ -154,10 +154,8 @@ def test_small_higher_terms_are_absorbed_and_large_ones_refused(tmp_path):
     ("name", "content", "message"),
     [
         ("a.json", '{"camera": {"w": 640}}', r"camera\.h: is missing|h: is missing"),
-        ("a.json", '{"camera": 3}', "camera"),
         ("a.json", json.dumps({"camera": {**CAMERA, "sigma": {"cx": -1}}}), r"camera\.sigma\.cx: is -1"),
         ("a.json", '{"frames": []}', "describes neither a camera nor a projector"),
-        ("a.json", "{", "is not valid JSON"),
         ("a.txt", "1 OPENCV 640 480 900\n", "camera 1 has model OPENCV with 1 parameters"),
         ("a.txt", "1 FOV 640 480 900 900 320 240 0.1\n", "has model FOV with 5 parameters"),
         ("a.txt", "1 PINHOLE 640 480 nan 900 320 240\n", "fl_x is nan pixels, which is impossible"),
@@ -167,17 +165,14 @@ def test_small_higher_terms_are_absorbed_and_large_ones_refused(tmp_path):
         ("a.yml", "%YAML:1.0\n---\nfocus: 3\n", r"contains no camera matrix \(it has: focus\)"),
         ("a.xml", "<html></html>", "cannot be read as an OpenCV file"),
         ("a.toml", "x = 1", r"is of no known kind \(\.toml\)"),
-        ("a.txt", "1 PINHOLE 640 480 0.9 0.9 320 240\n", "fl_x is 0.9 pixels, which is impossible"),
         ("a.txt", "1 PINHOLE 320 240 900 900 160 120\n", "was calibrated at 320 x 240, but the images are 640 x 480"),
         ("a.txt", "1 PINHOLE 640 480 9 9 3 2\n2 PINHOLE 640 480 9 9 3 2\n", "does not say which device is the camera"),
-        ("a.xml", xml("<a>" * 50_000), "nested too deeply"),
         ("a.xml", xml("<a>" * 50_000 + "</a>" * 50_000), "nested too deeply"),
         ("a.xml", '<!DOCTYPE a [<!ENTITY b "c">]>' + xml("<a>&b;</a>"), "document type"),
         ("a.xml", camera()[:-40], "no element found|mismatched|unclosed"),
         ("a.xml", xml("<a>1</a><a>2</a>"), "more than once"),
         ("a.xml", xml("<a>" + "1 " * 400_000 + "</a>"), "far more than a calibration"),
         ("a.yml", "%YAML:1.0\n---\na: " + "[" * 100_000, "nested too deeply"),
-        ("a.yml", "%YAML:1.0\n---\n" + "- " * 100_000, "nested too deeply"),
         ("a.yml", "%YAML:1.0\n---\n" + "".join(" " * k + "a:\n" for k in range(600)), "nested too deeply"),
         ("a.yml", "%YAML:1.0\n---\na: !!python/object/apply:os.abort []", "contains no camera matrix"),
         ("a.yml", "%YAML:1.0\n---\na: &x [ *x ]", "an earlier part of itself"),
@@ -190,15 +185,11 @@ def test_small_higher_terms_are_absorbed_and_large_ones_refused(tmp_path):
         ("a.xml", camera(".Nan 0. 320. 0. 900. 240. 0. 0. 1."), "is no 3 x 3 matrix of numbers"),
         ("a.xml", camera("-900. 0. 320. 0. 900. 240. 0. 0. 1."), "fl_x is -900"),
         ("a.xml", camera("900. 9. 320. 0. 900. 240. 0. 0. 1."), "has a skew of 9"),
-        ("a.xml", camera("900. 0. 320. 0. 900. 240. 0. 0. 2."), "the last row 0, 0, 2"),
         ("a.xml", camera("900. 0. 0. 0. 900. 0. 320. 240. 1."), "the last row 320, 240, 1"),
         ("a.xml", camera(width="wide"), "the size of the image is not two whole numbers"),
-        ("a.xml", camera(width="640.5"), "the size of the image is not two whole numbers"),
         ("a.json", json.dumps({"camera": {**CAMERA, "k1": 50}}), "multiply distances from the principal point by"),
         ("c.m", "fc = [ 900 x ];", "cannot be read as a MATLAB script"),
-        ("c.m", "disp hello", "cannot be read as a MATLAB script"),
         ("c.slcalib", "Kc\n1 2 3\n4 5\n", "cannot be read as SLStudio's calibration"),
-        ("c.slcalib", "", "is empty"),
     ],
 )
 def test_faults_name_file_cause_and_remedy(tmp_path, name, content, message):
@@ -207,15 +198,6 @@ def test_faults_name_file_cause_and_remedy(tmp_path, name, content, message):
     with pytest.raises(UserError, match=message) as caught:
         read_device_file(path, "camera", SIZE)
     assert name in str(caught.value) and "cause:" in str(caught.value) and "remedy:" in str(caught.value)
-
-
-def test_a_file_without_the_wanted_device(tmp_path):
-    path = tmp_path / "i.json"
-    path.write_text(json.dumps({"camera": CAMERA}))
-    with pytest.raises(UserError, match="describes no projector, only camera") as caught:
-        read_device_file(path, "projector", SIZE)
-    assert "--projector-intrinsics" in str(caught.value)
-    assert [entry.role for entry in read_entries(path)] == ["camera"]
 
 
 @pytest.mark.parametrize("suffix", ["xml", "yml", "yaml"])
@@ -232,12 +214,6 @@ def test_what_opencv_writes_is_read(tmp_path_factory, suffix, matrix, number, te
     np.testing.assert_array_equal(found["matrix"], matrix)
     np.testing.assert_allclose(found["small"], matrix.astype(np.float32), rtol=1e-6, atol=1e-37)
     assert found["number"] == number and found["text"].split() == ("t" + text).split()
-
-
-def test_what_is_right_is_read(tmp_path):
-    path = tmp_path / "a.xml"
-    path.write_text(camera("900. 0.01 320. 0. 900. 240. 0. 0. 1."))  # a skew of a rounding
-    assert read_device_file(path, "camera", SIZE).cx == 320.5
 
 
 def _rows(matrix):
@@ -297,8 +273,14 @@ def test_matlabs_toolbox_describes_one_camera_with_its_size(tmp_path):
         "kc = [ 0.08 ; -0.12 ; 0.001 ; -0.0007 ; 0 ];\nnx = 640;\nny = 480;\nomc_1 = [ 1e-3 ; 2 ; 3 ];\n"
     )
     assert _same_pixels(read_device_file(path, "camera", SIZE), LENS, 0.5) < 1e-9
-    with pytest.raises(UserError, match="calibrated at 640 x 480"):
-        read_device_file(path, "camera", (800, 600))
+    path.write_text(path.read_text().replace("alpha_c = 0.0", "alpha_c = 1e-5"))  # a skew of a rounding
+    assert _same_pixels(read_device_file(path, "camera", SIZE), LENS, 0.5) < 1e-9
+
+
+def test_a_file_without_the_wanted_device_is_refused(tmp_path):
+    (tmp_path / "i.json").write_text(json.dumps({"camera": CAMERA}))
+    with pytest.raises(UserError, match=r"describes no projector, only camera(.|\n)*--projector-intrinsics"):
+        read_device_file(tmp_path / "i.json", "projector", SIZE)
 
 
 @pytest.mark.parametrize(

@@ -77,27 +77,13 @@ def test_a_case(case: Case, tmp_path: Path) -> None:
     case.ends(call(case.main, *words))
 
 
-# Intrinsics files that people have: what they hold is read, or the terms that cannot be are named.
-
-
-@pytest.fixture
-def lenses() -> Path:
-    return folder_of("opencv_14_terms")
-
-
-def test_fourteen_coefficients_of_which_nine_to_fourteen_are_zero(lenses):
-    camera, projector = (
-        read_device_file(lenses / "stereo14_zero.yml", role, (1136, 1046)) for role in ("camera", "projector")
-    )
+@pytest.mark.parametrize(("role", "term"), [("camera", "k6 = -50.8"), ("projector", "k6 = -29.1")])
+def test_of_fourteen_lens_terms_those_that_are_zero_are_passed_over_and_others_named(role: str, term: str) -> None:
+    folder, size = folder_of("opencv_14_terms"), (1136, 1046)
+    camera, projector = (read_device_file(folder / "stereo14_zero.yml", one, size) for one in ("camera", "projector"))
     assert (camera.fl_x, camera.cx) == (3173.5470908336333, 568.0544331842342 + 0.5)
     assert (camera.k1, camera.k2, camera.p1) == (-0.18827534553754133, 2.7711625543207616, 0)
     assert (projector.cx, projector.k1) == pytest.approx((567.17323067777738 + 0.5, -0.24851802551104779), abs=1e-6)
-
-
-@pytest.mark.parametrize(("role", "term"), [("camera", "k6 = -50.8"), ("projector", "k6 = -29.1")])
-def test_a_rational_model_that_a_scan_cannot_express_is_named(lenses, role, term):
-    with pytest.raises(
-        UserError, match=rf"stereo\.yml: {role}: the lens model has terms beyond .*\({term}\)"
-    ) as caught:
-        read_device_file(lenses / "stereo.yml", role, (1136, 1046))
-    assert "CALIB_RATIONAL_MODEL" in str(caught.value)
+    said = rf"stereo\.yml: {role}: the lens model has terms beyond .*\({term}\)(.|\n)*CALIB_RATIONAL_MODEL"
+    with pytest.raises(UserError, match=said):
+        read_device_file(folder / "stereo.yml", role, size)

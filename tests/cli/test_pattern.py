@@ -16,7 +16,7 @@ from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.scan.images import read_image
 
-from .snapshots import Ended, call, expect, expect_refusals, succeed
+from .snapshots import Ended, expect, expect_refusals, succeed
 
 
 def pattern(*flags: object) -> Ended:
@@ -88,12 +88,6 @@ def test_flags_that_cannot_be_are_named_and_nothing_is_written(monkeypatch, tmp_
         [*CHARUCO_KIND, *SIDE, "--corners", "9x7"],
     )  # fmt: skip
     assert not list(tmp_path.iterdir())
-
-
-def test_nothing_is_overwritten(tmp_path):
-    (tmp_path / "mine.txt").write_text("x")
-    ended = call(main, "sl-pattern", "--output", tmp_path)
-    assert ended.status == 1 and "is not empty" in ended.err and len(list(tmp_path.iterdir())) == 1
 
 
 # Boards.

@@ -149,21 +149,6 @@ def test_an_interrupted_training_goes_on_and_ends_with_the_same_bytes(done, capt
         assert (output / name).read_bytes() == (done[0] / name).read_bytes()
 
 
-def test_interrupted_in_any_other_stage_it_says_how_to_go_on(result, captures, monkeypatch):
-    (result / "report.html").unlink()
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr("sl_nerfstudio.cli.evaluate.evaluate_scan", interrupted)
-        ended = call(main, "sl-scan", *words(captures, result))
-    assert ended.status == 130 and "to go on: sl-scan " in ended.err
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    succeed(main, "sl-scan", *words(captures, result))
-    assert (result / "report.html").exists()
-
-
 def test_a_scan_folder_begins_with_the_training_and_another_quality_is_another_run(done, tmp_path):
     scan, output = Path(shutil.copytree(done[0] / "scan", tmp_path / "scan")), tmp_path / "result"
     said = succeed(main, "sl-scan", scan, "--output", output, "--quality", "draft").out

@@ -138,16 +138,6 @@ def test_a_moved_run_is_found_beside_its_config(config, tmp_path):
         moved.rename(config.parent)
 
 
-@pytest.mark.parametrize("text", ["", "a: [", "just words", "!!python/object:no.such.Class {}", "a: 1\n"])
-def test_a_config_that_is_none(text, tmp_path):
-    (tmp_path / "config.yml").write_text(text)
-    with pytest.raises(
-        UserError,
-        match=r"config.yml(, line 1)?: (cannot be read as|is not a training config|no.such.Class is not a class)",
-    ):
-        load_run(tmp_path)
-
-
 def test_a_run_of_another_method(tmp_path):
     from nerfstudio.configs.method_configs import all_methods
 

@@ -10,7 +10,7 @@ from PIL import Image
 from sl_nerfstudio.dataparser.datamanager import SLDataManager, SLDataManagerConfig
 from sl_nerfstudio.dataparser.dataparser import SLDataParserConfig
 from sl_nerfstudio.errors import UserError
-from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange, project, unproject
+from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange, project
 from sl_nerfstudio.geometry.lie import inverse, transform
 from tests.dataparser.tiny_scan import CAMERA, TinyScan
 
@@ -54,11 +54,19 @@ def test_batch_matches_its_rays(datamanager: SLDataManager) -> None:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, SKEWED])
-def test_rays_are_nerfstudios_rays(tmp_path: Path, camera: Device) -> None:
+@pytest.mark.parametrize("own_focal_lengths", [(90.0, 90.0, 90.0), (90.0, 80.0, 90.0)])
+def test_rays_are_nerfstudios_rays(tmp_path: Path, camera: Device, own_focal_lengths: tuple[float, ...]) -> None:
     """The training rays equal those of nerfstudio's Cameras, which evaluation, rendering and exports use."""
-    m = manager(TinyScan(camera=camera).write(tmp_path / "scan"))
+    root = TinyScan(camera=camera).write(tmp_path / "scan")
+    content = json.loads((root / "transforms.json").read_text())
+    del content["fl_x"]
+    for record, focal in zip(content["frames"], own_focal_lengths, strict=True):
+        record["fl_x"] = focal
+    (root / "transforms.json").write_text(json.dumps(content))
+    m = manager(root)
     rays, batch = m.next_train(0)
     frame, row, column = batch["indices"].unbind(-1)
+    assert m.train_dataset.cameras.fx[:, 0].tolist() == list(own_focal_lengths)
     stock = m.train_dataset.cameras.generate_rays(frame[:, None], torch.stack([row, column], -1) + 0.5)
     torch.testing.assert_close(rays.origins, stock.origins, rtol=0, atol=1e-6)
     torch.testing.assert_close(rays.directions, stock.directions, rtol=0, atol=2e-6)
@@ -148,25 +156,6 @@ def test_all_cameras_are_at_refined_poses(tiny_root: Path) -> None:
         assert holder.cameras.generate_rays(0).metadata["sl_refined"].all()
     camera, _ = next(iter(m.fixed_indices_eval_dataloader))
     assert camera.metadata is not None and camera.metadata["sl_refined"].tolist() == [[True]]
-
-
-def test_a_frame_with_its_own_intrinsics(tmp_path: Path) -> None:
-    root = TinyScan().write(tmp_path / "scan")
-    content = json.loads((root / "transforms.json").read_text())
-    own = {key: [content[key]] * 3 for key in ("fl_x", "cx")}
-    own["fl_x"][1], own["cx"][1] = 80.0, 20.0
-    for key, values in own.items():
-        del content[key]
-        for frame, value in zip(content["frames"], values, strict=True):
-            frame[key] = value
-    (root / "transforms.json").write_text(json.dumps(content))
-    m = manager(root)
-    assert m.train_dataset.cameras.fx[:, 0].tolist() == [90.0, 80.0, 90.0]
-    rays, batch = m.next_train(0)
-    own = batch["indices"][:, 0] == 1
-    T = m.train_dataset.cameras.camera_to_worlds[1, :, :3]
-    expected = unproject(Intrinsics.of(m.dataparser.loaded.scan.frames[1].camera), rays.metadata["sl_uv"][own]) @ T.T
-    torch.testing.assert_close(rays.directions[own], expected, rtol=0, atol=1e-6)
 
 
 def test_scan_is_read_once_and_again_when_it_changes(tmp_path: Path) -> None:

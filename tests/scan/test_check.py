@@ -13,7 +13,6 @@ from sphere_scan import CAMERA, NAMES, PROJECTOR, edit, edit_coords, only_fault,
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.scan import FileError, check_scan, read_scan
-from sl_nerfstudio.scan.check import check_folder
 from sl_nerfstudio.scan.coordinates import read_coords, read_coords_size
 
 NAME = NAMES[1]
@@ -56,8 +55,6 @@ class Mine:
     [
         (zipped(coords=npy(np.array([Mine()], dtype=object), allow_pickle=True)), "holds pickled Python objects"),
         (zipped(coords=npy(image_coords(np.float64))), "holds float64 instead of float32"),
-        (zipped(coords=npy(image_coords(np.float16))), "holds float16 instead of float32"),
-        (zipped(coords=npy(image_coords(np.int32))), "holds int32 instead of float32"),
         (zipped(coords=npy(image_coords()[..., 0])), "has the shape (60, 72) instead of (H, W, 2)"),
         (zipped(coords=npy(image_coords().transpose(2, 0, 1))), "has the shape (2, 60, 72) instead of (H, W, 2)"),
         (zipped(coords=npy(image_coords()[:0])), "has the shape (0, 72, 2)"),
@@ -65,11 +62,9 @@ class Mine:
         (zipped(), "but holds nothing"),
         (zipped(**{f"a{i}": b"" for i in range(100)}), "holds 100 members"),
         (zipped(coords=GOOD[:-100]), "bytes, but its header says"),
-        (zipped(coords=GOOD + b"\0" * 8), "bytes, but its header says"),
         (zipped(coords=GOOD.replace(b"(60, 72, 2)", b"(60000, 72000, 2)", 1)), "bytes, but its header says"),
         (zipped(coords=b"no array"), "cannot be read"),
         (zipped(coords=GOOD)[:200], "cannot be read"),
-        (b"no archive", "cannot be read"),
         (b"", "is empty (0 bytes)"),
     ],
 )
@@ -128,10 +123,7 @@ def lose_x(coords):
     [
         (lambda c: c * NAN, "is NaN everywhere", "decoding failed", "leave the frame out"),
         (placed(np.inf), "holds infinities at 576 pixels", "division by zero", "write NaN"),
-        (placed(-np.inf), "holds infinities at 576 pixels", "marker", "write NaN"),
-        (placed(-1), "has the value (-1, -1) at 576 pixels", "stands for 'not decoded'", "write NaN"),
         (placed(0), "has the value (0, 0) at 576 pixels", "stands for 'not decoded'", "write NaN"),
-        (lambda c: np.nan_to_num(c, nan=-7), "has the value (-7, -7) at", "placeholder", "write NaN"),
         (lambda c: c * 0 + 50, "has the value (50, 50) at", "placeholder", "write NaN"),
         (lose_x, "has only one of x_p and y_p at 100 pixels", "decoded separately", "NaN for both"),
         (np.floor, "holds whole numbers only", "Gray-code", "add 0.5"),
@@ -171,14 +163,6 @@ def test_coordinates_half_a_pixel_off_are_seen_in_the_pattern(sphere, shift, cau
     assert (fault.file, fault.frame, fault.field) == ("transforms.json", None, "sl_coords_path")
     assert fault.problem == "are shifted relative to the pattern by half a pixel in x and y, in 4 of 4 frames"
     assert cause in fault.cause and remedy in fault.remedy
-
-
-def test_no_shift_is_seen_where_there_is_none_nor_in_one_frame_alone(sphere):
-    for content in check_folder(sphere).contents:
-        assert content.shift is not None
-        assert np.abs(content.shift).max() < 0.03
-    edit_coords(sphere, NAME, lambda coords: coords - np.float32(0.5))
-    assert check_scan(sphere) == []
 
 
 @pytest.mark.parametrize(
@@ -226,12 +210,9 @@ def test_pictures_of_nothing(sphere):
     assert check_scan(sphere) == []  # then the image is compared with the pattern
     Image.new("L", (CAMERA.w, CAMERA.h), 7).save(sphere / "images" / f"{NAME}.png")
     assert only_fault(sphere).file == f"images/{NAME}.png"
-
-
-def test_a_pattern_without_a_pattern(sphere):
     Image.new("L", (PROJECTOR.w, PROJECTOR.h), 200).save(sphere / "pattern.png")
-    fault = only_fault(sphere)
-    assert (fault.file, fault.problem) == ("pattern.png", "has the same value everywhere in the pattern")
+    said = {fault.file: fault.problem for fault in check_scan(sphere)}
+    assert said["pattern.png"] == "has the same value everywhere in the pattern"
 
 
 def test_a_frame_copied_under_another_name(sphere):

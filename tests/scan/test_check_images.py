@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import gaussian_filter
 from sphere_scan import CAMERA, NAMES, edit, edit_coords, only_fault, pattern_image, write_sphere
 
-from sl_nerfstudio.errors import ScanError
-from sl_nerfstudio.scan import check_scan, read_scan, write_transforms
+from sl_nerfstudio.scan import check_scan, read_scan
 from sl_nerfstudio.scan.check_geometry import OtherClouds
 from sl_nerfstudio.scan.check_images import match_image
 from sl_nerfstudio.scan.images import encode_png
@@ -136,15 +135,6 @@ def test_a_picture_is_read_and_other_frames_have_none(sphere):
     assert np.array_equal(scan.frames[1].read_color(), gradient()) and scan.frames[0].read_color() is None
 
 
-def test_the_writer_writes_it_and_refined_poses_keep_it(tmp_path):
-    scan = read_scan(write_sphere(tmp_path / "scan", color=gradient()))
-    assert np.array_equal(scan.frames[2].read_color(), gradient())
-    write_transforms(tmp_path / "refined.json", scan, scan.poses)
-    assert (tmp_path / "refined.json").read_text().count('"sl_color_path": "color/frame_') == 4
-    with pytest.raises(ValueError, match="color of"):
-        write_sphere(tmp_path / "b", color=gradient()[1:])
-
-
 @pytest.mark.parametrize(
     ("picture", "problem"),
     [
@@ -163,13 +153,3 @@ def test_a_picture_with_the_pattern_is_refused(sphere):
     fault = only_fault(sphere)
     assert "shows the pattern (correlation 0.9" in fault.problem or "shows the pattern (correlation 1" in fault.problem
     assert "taken without the pattern" in fault.remedy
-
-
-def test_missing_and_misspelt_pictures(sphere):
-    edit(sphere, lambda document: document["frames"][1].update(sl_color_path="color/none.png"))
-    with pytest.raises(ScanError, match=r"color/none.png: .*is missing"):
-        read_scan(sphere)
-    edit(
-        sphere, lambda document: document["frames"][1].update(sl_color_paht=document["frames"][1].pop("sl_color_path"))
-    )
-    assert "did you mean 'sl_color_path'?" in only_fault(sphere).remedy

@@ -17,7 +17,7 @@ from sl_nerfstudio.cli.check import CheckArguments, check
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.scan import FileError, check_scan, read_scan
 from sl_nerfstudio.scan.coordinates import CoordinateFiles
-from tests.dataparser.coordinate_images import one_tiff, pair_of_indices, pair_of_parts, parts, replace_coords
+from tests.dataparser.coordinate_images import one_tiff, pair_of_indices, pair_of_parts, replace_coords
 
 NAME = NAMES[1]
 SIZE = np.array([PROJECTOR.w, PROJECTOR.h], dtype=np.float64)
@@ -47,12 +47,11 @@ def change(root: Path, path: str, function: Callable[[ndarray], ndarray]) -> Non
 
 
 @pytest.mark.parametrize("in_frames", [False, True])
-def test_pairs_come_back_to_half_a_step(sphere_original, tmp_path, in_frames):
-    exact = coords_of(sphere_original)
-    root = Path(shutil.copytree(sphere_original, tmp_path / "scan"))
-    replace_coords(root, pair_of_parts, "parts_of_65535", in_frames)
-    assert check_scan(root) == []
-    found = coords_of(root)
+def test_pairs_come_back_to_half_a_step(sphere, in_frames):
+    exact = coords_of(sphere)
+    replace_coords(sphere, pair_of_parts, "parts_of_65535", in_frames)
+    assert check_scan(sphere) == []
+    found = coords_of(sphere)
     assert np.array_equal(np.isnan(found), np.isnan(exact)) and np.isfinite(exact).any()
     off = np.abs(found - exact)[np.isfinite(exact).all(-1)]
     half = SIZE / 65535 / 2
@@ -60,18 +59,16 @@ def test_pairs_come_back_to_half_a_step(sphere_original, tmp_path, in_frames):
     assert (off.max(0) > 0.9 * half).all(), "the bound is not met by chance"
 
 
-def test_whole_numbers_of_pixels_stand_for_their_centres(sphere_original, tmp_path):
-    exact = coords_of(sphere_original)
-    root = replace_coords(Path(shutil.copytree(sphere_original, tmp_path / "scan")), pair_of_indices, "pixels")
+def test_whole_numbers_of_pixels_stand_for_their_centres(sphere):
+    exact = coords_of(sphere)
+    replace_coords(sphere, pair_of_indices, "pixels")
     expected = np.where((exact >= 1).all(-1, keepdims=True), np.floor(exact) + 0.5, np.nan).astype(np.float32)
-    assert np.array_equal(coords_of(root), expected, equal_nan=True)
+    assert np.array_equal(coords_of(sphere), expected, equal_nan=True)
 
 
-def test_floating_point_tiff_comes_back_bit_for_bit(sphere_original, tmp_path):
-    exact = coords_of(sphere_original)
-    root = replace_coords(Path(shutil.copytree(sphere_original, tmp_path / "scan")), one_tiff, "pixels")
-    assert check_scan(root) == []
-    assert coords_of(root).tobytes() == exact.tobytes()
+def test_floating_point_tiff_comes_back_bit_for_bit(sphere_original, tiffs):
+    assert check_scan(tiffs) == []
+    assert coords_of(tiffs).tobytes() == coords_of(sphere_original).tobytes()
 
 
 @pytest.mark.parametrize("third", [0.0, 1.0])
@@ -166,20 +163,15 @@ def test_every_fault_of_the_keys_at_once(pairs):
         frames[3]["sl_coords_units"] = "percent"
 
     edit(pairs, spoil)
-    said = {(fault.frame, fault.field): fault.problem for fault in check_scan(pairs)}
+    faults = check_scan(pairs)
+    said = {(fault.frame, fault.field): fault.problem for fault in faults}
     assert said == {
         (NAMES[0], "coords_y"): "is missing, although coords_x is given",
         (NAMES[1], "sl_coords_units"): "is missing, although the coordinates are images",
         (NAMES[2], "coords_x"): "is given together with sl_coords_path",
         (NAMES[3], "sl_coords_units"): "is 'percent'",
     }
-
-
-def test_a_missing_unit_names_the_two_that_there_are(pairs):
-    edit(pairs, lambda document: document.pop("sl_coords_units"))
-    faults = check_scan(pairs)
-    assert [fault.frame for fault in faults] == list(NAMES)
-    assert faults[0].remedy.startswith('state "sl_coords_units": "pixels" or "parts_of_65535"')
+    assert any(f.remedy.startswith('state "sl_coords_units": "pixels" or "parts_of_65535"') for f in faults)
 
 
 def test_contradicting_units(pairs):
@@ -233,13 +225,6 @@ def test_a_wrong_unit_is_found_in_either_direction(sphere_original, tmp_path):
     assert all("of the pattern (x_p" in f.problem and '"pixels"' in f.remedy for f in faults)
 
 
-def test_values_beyond_the_pattern(tiffs):
-    coords = tifffile.imread(tiffs / BOTH)
-    tifffile.imwrite(tiffs / BOTH, coords + np.float32([80, 0]), photometric="minisblack", planarconfig="contig")
-    fault = only_fault(tiffs)
-    assert fault.file == BOTH and "of the pixels outside the pattern" in fault.problem
-
-
 GOOD = np.random.default_rng(0).uniform(5, 90, (CAMERA.h, CAMERA.w, 2)).astype(np.float32)
 PLANE = {"photometric": "minisblack", "planarconfig": "contig"}
 
@@ -248,11 +233,9 @@ PLANE = {"photometric": "minisblack", "planarconfig": "contig"}
     ("write", "problem"),
     [
         (lambda path: tifffile.imwrite(path, GOOD), "holds 60 images"),
-        (lambda path: tifffile.imwrite(path, np.moveaxis(GOOD, -1, 0)), "holds 2 images"),
         (lambda path: tifffile.imwrite(path, GOOD[..., 0]), "has 1 channel instead of 2 or 3"),
         (lambda path: tifffile.imwrite(path, np.dstack([GOOD, GOOD]), **PLANE), "has 4 channels instead of 2 or 3"),
         (lambda path: tifffile.imwrite(path, GOOD.astype(np.float16), **PLANE), "holds float16 instead of float32"),
-        (lambda path: tifffile.imwrite(path, GOOD.astype(np.float64), **PLANE), "holds float64 instead of float32"),
         (lambda path: tifffile.imwrite(path, GOOD.astype(np.uint8), **PLANE), "holds uint8 instead of float32"),
         (lambda path: tifffile.imwrite(path, np.dstack([GOOD, GOOD[..., :1]]), photometric="rgb"),
          "has a third channel that is not the same at all decoded pixels"),
@@ -297,7 +280,3 @@ def test_exr_is_refused_with_the_command_that_converts_it(tiffs):
     fault = only_fault(tiffs)
     assert fault.problem == "is an EXR file, a format that is not read"
     assert "OPENCV_IO_ENABLE_OPENEXR=1 python -c" in fault.remedy
-
-
-def test_the_step_of_16_bit_is_finer_than_any_decoder():
-    assert parts(np.array([[1.0, 1.0]]), np.array([1920, 1080])).tolist() == [[34, 61]]

@@ -11,11 +11,6 @@ from sl_nerfstudio.scan import check_scan, read_scan, require_valid
 from sl_nerfstudio.scan.document import MAX_DEPTH, FileError, read_document
 
 
-def test_a_valid_scan_has_no_faults(sphere):
-    assert check_scan(sphere) == []
-    assert [frame.name for frame in require_valid(sphere).frames] == list(NAMES)
-
-
 @pytest.mark.parametrize(
     ("content", "problem", "cause"),
     [
@@ -101,34 +96,22 @@ def set_key(key, value):
 @pytest.mark.parametrize(
     ("key", "value", "problem"),
     [
-        ("sl_format", KeyError, "is missing"),
         ("sl_format", 2, "is 2"),
         ("sl_format", "1", "is '1' instead of a number"),
-        ("sl_format", True, "is True instead of a number"),
         ("units", KeyError, "is missing"),
         ("units", "inch", "is 'inch'"),
         ("units", None, "is null instead of a value"),
-        ("scale", KeyError, "is missing"),
-        ("scale", True, "is True instead of an object { .. }"),
         ("scale.known", "yes", "is 'yes' instead of true or false"),
         ("scale.source", 3, "is 3 instead of a text"),
-        ("projector", KeyError, "is missing"),
         ("projector", [1], "is [1] instead of an object { .. }"),
-        ("projector.pattern_path", KeyError, "is missing"),
         ("projector.model", "FISHEYE", "is 'FISHEYE'"),
-        ("projector.model", KeyError, "is missing"),
         ("camera_model", "OPENCV_FISHEYE", "is 'OPENCV_FISHEYE'"),
         ("camera_model", "DOE", "is 'DOE'"),
-        ("fl_x", KeyError, "is missing"),
-        ("fl_x", [150], "is [150] instead of a number"),
         ("projector.fl_y", "12", "is '12' instead of a number"),
         ("w", 72.5, "is 72.5, not a whole number greater than 0"),
-        ("h", -60, "is -60, not a whole number greater than 0"),
-        ("cx", 1e6, "is 1e+06, far outside an image of 72 pixels"),
         ("projector.cy", -1e9, "is -1e+09, far outside an image of 96 pixels"),
         ("k3", 0.1, "is not 0"),
         ("frames", KeyError, "is missing or is not a list"),
-        ("frames", {"0": 1}, "is missing or is not a list"),
         ("frames", [], "is empty"),
         ("frames", lambda frames: frames[:1], "holds only one frame"),
         ("frames", lambda frames: [*frames, "frame"], "is not an object { .. }"),
@@ -149,15 +132,10 @@ def test_wrong_or_missing_values(sphere, key, value, problem):
     ("key", "value", "problem"),
     [
         ("file_path", KeyError, "is missing"),
-        ("file_path", 7, "is 7 instead of a text"),
         ("sl_coords_path", KeyError, "is missing"),
-        ("sl_coords_path", None, "is null instead of a value"),
         ("mask_path", 0, "is 0 instead of a text"),
-        ("transform_matrix", KeyError, "is missing"),
-        ("transform_matrix", 1, "is 1 instead of a list of four rows of four numbers"),
         ("transform_matrix", [[1, 2], [3]], "is [[1, 2], [3]] instead of a list of four rows"),
         ("projector_transform_matrix", [["1"] * 4] * 4, "instead of a list of four rows of four numbers"),
-        ("projector_transform_matrix", [], "is [] instead of"),
     ],
 )
 def test_wrong_or_missing_values_of_a_frame(sphere, key, value, problem):

@@ -47,11 +47,8 @@ def last_row(*row):
     [
         (times(-1, 1, 1), "is a reflection (the determinant of its rotation is -1)", "left-handed"),
         (times(2, 2, 2), "is scaled: its rotation is 2 times a rotation", "similarity"),
-        (times(1e-3, 1e-3, 1e-3), "is scaled: its rotation is 0.001 times a rotation", "unit"),
-        (times(-2, -2, -2), "is scaled: its rotation is 2 times a reflection", "divide"),
         (times(1, 1, 0), "has no rotation in its upper left 3 x 3 block", "six digits"),
         (sheared, "has no rotation in its upper left 3 x 3 block", "sheared"),
-        (lambda T: T * 0, "has the last row 0, 0, 0, 0 instead of 0, 0, 0, 1", "rigid motion"),
         (lambda T: T * 2, "has the last row 0, 0, 0, 2 instead of 0, 0, 0, 1", "rigid motion"),
         (last_row(0, 0, 1, 0), "has the last row 0, 0, 1, 0 instead of 0, 0, 0, 1", "projective"),
         (lambda T: T.T, "and the last column 0, 0, 0, 1", "transposed"),
@@ -130,39 +127,25 @@ def test_devices_that_can(device):
     assert list(device_problems(device)) == []
 
 
-def test_intrinsics_of_another_resolution(sphere):
-    edit(sphere, lambda document: document.update(w=144, h=120))
-    faults = check_scan(sphere)
-    assert len(faults) == 4 * len(NAMES)  # image, pattern image, mask and coordinates of each frame
-    for fault in faults:
-        assert fault.problem == "is 72 x 60 pixels, but the camera has 144 x 120"
-        assert "resized, or the intrinsics are those of another resolution" in fault.cause
-
-
-def test_each_frame_with_a_camera_of_its_own(sphere):
-    def own(document):
-        keys = ("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
-        common = {key: document.pop(key) for key in keys}
-        for record in document["frames"]:
-            record.update(common)
-        document["frames"][2]["fl_x"] = 151.0
-
-    edit(sphere, own)
-    scan = read_scan(sphere)
-    assert [frame.camera.fl_x for frame in scan.frames] == [150, 150, 151, 150]
-    assert scan.frames[0].camera == CAMERA
-    edit(sphere, lambda document: document["frames"][1].pop("cy"))
-    fault = only_fault(sphere)
-    assert (fault.frame, fault.field, fault.problem) == (NAMES[1], "cy", "is missing")
-
-
-def test_part_common_part_own(sphere):
+def test_each_frame_has_intrinsics_of_its_own_or_they_are_common_to_all(sphere):
     edit(sphere, lambda document: [r.update(fl_x=150.0 + i) for i, r in enumerate(document["frames"])])
     faults = check_scan(sphere)
     assert {(fault.frame, fault.field) for fault in faults} == {(name, "fl_x") for name in NAMES[1:]}
     assert faults[0].problem == "is 151.0 here but 150.0 for all frames"
     edit(sphere, lambda document: [document.pop(key) for key in ("fl_x", "k1", "k2", "p1", "p2")])
     assert [frame.camera.fl_x for frame in read_scan(sphere).frames] == [150, 151, 152, 153]
+
+    def own(document):
+        common = {key: document.pop(key) for key in ("camera_model", "w", "h", "fl_y", "cx", "cy")}
+        for record in document["frames"]:
+            record.update(common)
+
+    edit(sphere, own)
+    scan = read_scan(sphere)
+    assert [frame.camera.fl_x for frame in scan.frames] == [150, 151, 152, 153] and scan.frames[0].camera == CAMERA
+    edit(sphere, lambda document: document["frames"][1].pop("cy"))
+    fault = only_fault(sphere)
+    assert (fault.frame, fault.field, fault.problem) == (NAMES[1], "cy", "is missing")
 
 
 SIGMA = vars(PoseSigma(3.0, 1.0, 2.0, 0.25))

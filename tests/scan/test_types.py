@@ -17,7 +17,6 @@ from sl_nerfstudio.scan import (
     ScaleBar,
     check_scan,
     measured_length,
-    read_poses,
     read_scan,
     write_transforms,
 )
@@ -138,7 +137,6 @@ def at(*pixel):
 
 
 OTHER = at(30.0, 30.0)
-OUTSIDE = f"has the pixel (30, 61), outside the {CAMERA.w} x {CAMERA.h} pixels of frame {NAMES[1]!r}"
 
 
 def bar(other=OTHER, length=5.0):
@@ -216,4 +214,3 @@ def test_the_length_grows_with_the_poses_and_does_not_depend_on_the_world(root):
     length = measured_length(scan, BAR, scan.poses)
     S = Similarity(2.5, np.diag([-1.0, -1.0, 1.0]), np.array([30.0, -500.0, 7.0]))
     assert measured_length(scan, BAR, scan.poses.mapped(S)) == pytest.approx(2.5 * length, rel=1e-9)
-    assert read_poses(root / "transforms.json", scan).baseline == pytest.approx(scan.poses.baseline)

@@ -48,12 +48,13 @@ def test_everything_comes_back_as_it_was(tmp_path):
     coords = random.normal(size=(*shape, 2)).astype(np.float32)
     coords[:5] = np.nan
     mask = random.random(shape) < 0.5
+    color = random.integers(0, 256, (*shape, 3), dtype=np.uint8)
     own = Device(72, 60, 140.0, 141.0, 33.0, 29.0, k1=0.1, k2=-0.01, p1=1e-3, p2=2e-3)
     projector = Device(128, 96, 260.0, 255.0, 66.0, 45.0, k1=-0.1, model="DOE")
     sigma = PoseSigma(1.0, 2.0, 3.0, 4.0)
     with ScanWriter(tmp_path / "ä" / "scan", **settings(projector=projector, extra={"comment": "é"})) as writer:
-        writer.add_frame("eins", **frame(0, image=image, pattern=pattern, coords=coords, mask=mask, pose_sigma=sigma))
-        writer.add_frame("zwei", **frame(1, camera=own, extra={"exposure": 0.1}))
+        writer.add_frame("eins", **frame(0, image=image, pattern=pattern, coords=coords, mask=mask, color=color))
+        writer.add_frame("zwei", **frame(1, camera=own, extra={"exposure": 0.1}, pose_sigma=sigma))
         writer.add_file("ground_truth/mesh.ply", b"ply")
     scan = read_scan(tmp_path / "ä" / "scan")
     assert (scan.units, scan.scale, scan.projector) == ("mm", Scale(True, "measured with a ruler"), projector)
@@ -64,7 +65,8 @@ def test_everything_comes_back_as_it_was(tmp_path):
     assert np.array_equal(one.read_pattern(), pattern.astype(np.float32) / np.float32(65535))
     assert np.array_equal(one.read_coords(), coords, equal_nan=True)
     assert np.array_equal(one.read_mask(), mask)
-    assert (one.pose_sigma, two.pose_sigma) == (sigma, None)
+    assert np.array_equal(one.read_color(), color) and two.read_color() is None
+    assert (one.pose_sigma, two.pose_sigma) == (None, sigma)
     assert np.array_equal(one.T_world_camera, poses()[0][0])
     assert np.array_equal(two.T_world_projector, poses()[1][1])
     assert (two.pattern_path, two.mask_path) == (None, None)
@@ -146,7 +148,7 @@ def test_faulty_settings(tmp_path, changes, message):
         ("..", {}, "is not a file name"),
         ("", {}, "is not a file name"),
         ("f1", {"image": np.zeros((5, 5), np.uint8)}, "image of f1 is (5, 5), the camera (60, 72)"),
-        ("f1", {"coords": np.zeros((5, 5, 2), np.float32)}, "coords of f1 is (5, 5)"),
+        ("f1", {"color": np.zeros((5, 5, 3), np.uint8)}, "color of f1 is (5, 5)"),
         ("f1", {"T_world_camera": np.diag([2.0, 2, 2, 1])}, "transform_matrix is scaled"),
         ("f1", {"T_world_projector": np.full((4, 4), np.nan)}, "projector_transform_matrix holds NaN or infinity"),
         ("f1", {"extra": {"quality": float("nan")}}, "not JSON compliant"),

@@ -1,7 +1,9 @@
-"""Damaged intrinsics, patterns, poses and meshes: refused with a message, or what they were; never a crash."""
+"""Damaged intrinsics, patterns, poses, meshes and scans: refused with a message, or what they were; never a crash."""
 
 import json
+import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -11,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from sl_nerfstudio.calibration.formats import read_device_file
-from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.errors import ScanError, UserError
 from sl_nerfstudio.evaluation.evaluate import read_points
 from sl_nerfstudio.meshing.files import read_mesh, write_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
@@ -19,7 +21,11 @@ from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.grid import GridPattern
 from sl_nerfstudio.processing.inputs import read_given_poses
+from sl_nerfstudio.scan import PickedPixel, PoseSigma, Scale, ScaleBar, check_scan, read_scan
 from tests.fuzz.damage import IMPOSSIBLE, damaged, places, removed, replaced
+from tests.scan.sphere_scan import NAMES, write_sphere
+
+few = settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 
 SIZE = (640, 480)
 K = np.array([[900.0, 0, 322.3], [0, 905.0, 236.8], [0, 0, 1]])
@@ -27,17 +33,12 @@ LENS = np.array([[0.08, -0.12, 0.001, -0.0007]])
 SPHERE = Mesh(
     np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, -1, -1]]), np.array([[0, 1, 2], [0, 3, 1], [1, 3, 2], [2, 3, 0]])
 )
-few = settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 
 
 def storage(path):
     file = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
-    for key, value in (
-        ("image_width", 640),
-        ("image_height", 480),
-        ("camera_matrix", K),
-        ("distortion_coefficients", LENS),
-    ):
+    values = {"image_width": 640, "image_height": 480, "camera_matrix": K, "distortion_coefficients": LENS}
+    for key, value in values.items():
         file.write(key, value)
     file.release()
     return path.read_bytes()
@@ -142,3 +143,94 @@ def test_impossible_poses(tmp_path_factory, data):
     path = tmp_path_factory.getbasetemp() / "poses.json"
     path.write_text(changed({"units": "mm", "frames": FRAMES}, data))
     accepted(path, lambda path: bool(read_given_poses(path, ["a", "b", "c"]).known.sum() >= 2))
+
+
+# Scans: the check names faults or finds the same scan.
+
+SIGMA = PoseSigma(3.0, 1.0, 2.0, 0.25)
+BAR = ScaleBar((PickedPixel(NAMES[1], (30.25, 20.0)), PickedPixel(NAMES[3], (40.5, 33.5))), 51.5)
+OPTIONAL = {"source", "mask_path", "sl_pattern_path", "sl_pose_sigma", "k1", "k2", "p1", "p2"}
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory):
+    root = write_sphere(tmp_path_factory.mktemp("fuzz") / "scan", frames=4, scale=Scale(True, "a ruler", bar=BAR))
+    path = root / "transforms.json"
+    document = json.loads(path.read_text())
+    document["sl_pose_sigma"] = vars(SIGMA)
+    path.write_text(json.dumps(document))
+    return root
+
+
+@pytest.fixture(scope="module")
+def root(original, tmp_path_factory):
+    """A copy to be damaged; every test puts back what it changed."""
+    return Path(shutil.copytree(original, tmp_path_factory.mktemp("damaged") / "scan"))
+
+
+def pixels(scan):
+    frames = [
+        array for f in scan.frames for array in (f.read_image(), f.read_pattern(), f.read_coords(), f.read_mask())
+    ]
+    return [scan.read_pattern(), *frames]
+
+
+@few
+@given(data=st.data())
+def test_impossible_values_are_refused(original, root, data):
+    document = json.loads((original / "transforms.json").read_text())
+    place = data.draw(st.sampled_from(list(places(document))))
+    value = data.draw(st.sampled_from(IMPOSSIBLE))
+    (root / "transforms.json").write_text(json.dumps(replaced(document, place, value)))
+    faults = check_scan(root)
+    assert faults or may_stay(place, value), f"{place} = {value!r:.60} was accepted"
+    str(ScanError(faults)) if faults else read_scan(root)
+
+
+def may_stay(place, value):
+    """Texts for people may be anything, what is optional may be absent, and -1 is a number like others."""
+    key = place[-1]
+    return (
+        key == "source"
+        or (value is None and key in OPTIONAL)
+        or (value == -1 and (isinstance(key, int) or key in ("k1", "k2", "cx", "cy")))
+        or (key == "units" and value == "arbitrary")
+    )
+
+
+@few
+@given(data=st.data())
+def test_missing_values_are_refused(original, root, data):
+    document = json.loads((original / "transforms.json").read_text())
+    place = data.draw(st.sampled_from(list(places(document))))
+    (root / "transforms.json").write_text(json.dumps(removed(document, place)))
+    faults = check_scan(root)
+    frame = len(place) == 2 and place[0] == "frames" and place[1] not in (1, 3)  # the known length is in 1 and 3
+    bar_is_gone = place == ("scale", "source")
+    assert faults or frame or bar_is_gone or place[-1] in OPTIONAL, f"without {place} it was accepted"
+
+
+@few
+@given(data=st.data())
+def test_a_damaged_file_is_refused_or_holds_the_same(original, root, data):
+    files = sorted(p.relative_to(original) for p in original.rglob("*.*") if p.suffix in (".png", ".npz"))
+    name = data.draw(st.sampled_from(files))
+    content = (original / name).read_bytes()
+    (root / "transforms.json").write_bytes((original / "transforms.json").read_bytes())
+    try:
+        (root / name).write_bytes(data.draw(damaged(content)))
+        if not check_scan(root):
+            same = zip(pixels(read_scan(root)), pixels(read_scan(original)), strict=True)
+            assert all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in same), name
+    finally:
+        (root / name).write_bytes(content)
+
+
+@few
+@given(data=st.data())
+def test_a_damaged_document_is_no_crash(original, root, data):
+    (root / "transforms.json").write_bytes(data.draw(damaged((original / "transforms.json").read_bytes())))
+    if faults := check_scan(root):
+        assert str(ScanError(faults))
+        with suppress(UserError):
+            read_scan(root)
