@@ -36,6 +36,13 @@ import {library}
 print([name for name in {names} if name in sys.modules])
 """
 
+JUDGING = """
+import sys
+import sl_nerfstudio.evaluation.evaluate
+import sl_nerfstudio.evaluation.report.scan_report
+print("nerfstudio" in sys.modules)
+"""
+
 
 def printed(code: str, folder: Path) -> list[str]:
     command = [sys.executable, "-W", "ignore", "-c", code]
@@ -49,6 +56,10 @@ def test_loading_a_run_does_not_import_the_compiler_until_somebody_asks(tmp_path
 
 def test_open3d_comes_without_its_web_viewer_until_somebody_asks(tmp_path):
     assert printed(OPEN3D.format(left_out=list(_LEFT_OUT)), tmp_path)[-3:] == ["[]", "True", "True"]
+
+
+def test_a_scan_is_judged_without_nerfstudio(tmp_path):
+    assert printed(JUDGING, tmp_path) == ["False"]
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ from sl_nerfstudio.parallel import one_library_thread
 from sl_nerfstudio.processing.result import ProcessRecord, read_record
 from sl_nerfstudio.review.agreement import CrossFrameAgreement, compare_scan_frames
 from sl_nerfstudio.review.verdict import DepartedFrame, departed_frames
-from sl_nerfstudio.runs.export import read_covariance
+from sl_nerfstudio.runs.pose_covariance import read_covariance
 from sl_nerfstudio.scan import (
     FileError,
     Frame,

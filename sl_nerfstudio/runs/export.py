@@ -15,8 +15,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
-from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, SelfCalibration
+from sl_nerfstudio.bundle_adjustment.parameters import SelfCalibration
 from sl_nerfstudio.console import phase, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
@@ -52,13 +51,13 @@ from sl_nerfstudio.runs.cameras import (
     surface_tracks,
 )
 from sl_nerfstudio.runs.export_settings import BLENDER_FILE, COLMAP_FOLDER, ExportSettings, Standing
+from sl_nerfstudio.runs.pose_covariance import write_covariance
 from sl_nerfstudio.runs.run import TrainedModel, TrainedRun
-from sl_nerfstudio.scan import FileError, PoseSigma, Scan, write_transforms
-from sl_nerfstudio.scan.coordinates import ARRAY_DAMAGE
+from sl_nerfstudio.scan import PoseSigma, Scan, write_transforms
 from sl_nerfstudio.scan.document import TRANSFORMS
 from sl_nerfstudio.scan.types import UNITS
 from sl_nerfstudio.scan.write import encode_json, sigma_fields
-from sl_nerfstudio.storage import encode_npz, write_atomic
+from sl_nerfstudio.storage import write_atomic
 
 # Cameras and trajectories of a run, written for other programs.
 
@@ -82,40 +81,6 @@ def write_device_files(
             files[f"{name}_kitti.txt"] = encode_kitti(devices, unit_m or 1.0)
     for name, content in files.items():
         write_atomic(folder / name, content)
-
-
-# pose_covariance.npz beside refined poses: the joint covariance of all poses and the intrinsics.
-
-COVARIANCE = "pose_covariance.npz"
-_AGAIN = "export again with sl-export --poses"
-
-
-def write_covariance(folder: Path, scan: Scan, joint: JointCovariance | None) -> None:
-    """Write the file, in the scan's world and unit; with None, remove that of an earlier export."""
-    path = folder / COVARIANCE
-    if joint is None:
-        path.unlink(missing_ok=True)
-        return
-    names = np.array([frame.name for frame in scan.frames])
-    write_atomic(path, encode_npz({"factor": joint.factor, "frames": names, "units": np.array(scan.units)}))
-
-
-def read_covariance(folder: Path, scan: Scan) -> JointCovariance | None:
-    """The covariance in a folder of refined poses; None if there is none. Raises FileError for one that is not it."""
-    path = folder / COVARIANCE
-    if not path.exists():
-        return None
-    try:
-        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            factor, frames, units = archive["factor"], archive["frames"].tolist(), str(archive["units"])
-    except (*ARRAY_DAMAGE, KeyError) as error:
-        raise FileError(path, f"cannot be read ({error})", "it is damaged or another file", _AGAIN) from error
-    if frames != [frame.name for frame in scan.frames] or units != scan.units:
-        raise FileError(path, "is that of other frames or another unit", "the poses are those of another scan", _AGAIN)
-    size = 12 * len(frames) + UNKNOWNS
-    if factor.ndim != 2 or len(factor) != size or factor.dtype != np.float64 or not np.isfinite(factor).all():
-        raise FileError(path, f"factor: is {factor.dtype} {factor.shape}", "the file is damaged", _AGAIN)
-    return JointCovariance(factor)
 
 
 # What a person needs to repeat a run: settings, versions, convergence; as plain JSON values.

@@ -268,3 +268,18 @@ def test_a_mesh_that_another_program_changed_is_not_overwritten(result, captures
     (result / "mesh.ply").unlink()
     succeed(main, "sl-scan", *words(captures, result, *LENGTH))
     assert read_image(result / "scan/images/pose 0.png").shape == (160, 160)
+
+
+def test_interrupted_in_any_other_stage_it_says_how_to_go_on(result, captures, monkeypatch):
+    (result / "report.html").unlink()
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sl_nerfstudio.cli.evaluate.evaluate_scan", interrupted)
+        ended = call(main, "sl-scan", *words(captures, result))
+    assert ended.status == 130 and "to go on: sl-scan " in ended.err
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    succeed(main, "sl-scan", *words(captures, result))
+    assert (result / "report.html").exists()

@@ -5,6 +5,7 @@ import pytest
 
 from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.decoders import DECODERS, GrayCodeDecoder, choose_decoder
+from sl_nerfstudio.decoding.grid import GridImageDecoder
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.pattern.files import LAYOUTS
 from sl_nerfstudio.pattern.gray_code import GrayCode
@@ -89,3 +90,14 @@ def test_a_stated_order_is_believed_unless_the_images_show_another():
     with pytest.raises(DecodingError, match="as in a mirror") as caught:
         GrayCodeDecoder(layout, order_stated=True).decode(mirrored, NAMES)
     assert "from rear to front projection" in caught.value.remedy
+
+
+def test_the_network_decoder_reads_the_one_image_of_a_frame():
+    grid = GridPattern(w=400, h=400)
+    image = np.rint(255 * grid.render()[40:300, 60:340]).astype(np.uint8)
+    found, expected = DECODERS["network"](grid).decode([image], ["a.png"]), GridImageDecoder(grid).decode(image)
+    np.testing.assert_array_equal(found.coords, expected.coords)
+    np.testing.assert_array_equal(found.pattern, expected.pattern)
+    x, y = np.meshgrid(np.arange(280) + 60.5, np.arange(260) + 40.5)
+    error = np.linalg.norm(found.coords - np.stack([x, y], -1), axis=-1)[10:-10, 10:-10]
+    assert np.isfinite(error).mean() > 0.95 and np.nanmax(error) < 1 and np.nanmedian(error) < 0.1

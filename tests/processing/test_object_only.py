@@ -129,3 +129,14 @@ def test_the_document_has_planes_and_shares(object_only):
     assert document["planes"][0]["normal"] == [0, 0, 1] and document["planes"][0]["offset"] == 2
     assert (document["object"], document["planes_left_out"], document["beyond_left_out"]) == (0.125, 0.375, 0.5)
     assert document["frames"][0] == {"name": "a", "object": 0.25, "plane": 0.75, "beyond": 0.0}
+
+
+@pytest.mark.slow
+def test_without_the_flag_the_table_stays(on_a_table, ramps_registered, tmp_path):
+    captures, truth = on_a_table
+    result = process(captures.config(tmp_path / "s", no_adjust=True), render_processing_report, lambda _: None)
+    assert result.object_only is None
+    assert json.loads((tmp_path / "s" / "processing.json").read_text())["object_only"] is None
+    frame = read_scan(tmp_path / "s").frames[0]
+    assert (frame.read_mask() & ~truth[frame.name]).sum() > 500
+    assert "left out around" not in (tmp_path / "s" / "processing.html").read_text()

@@ -409,3 +409,15 @@ def test_solids_are_what_they_say():
     assert mesh.volume == pytest.approx(40 * 30 * 20 + cap - 2 / 3 * np.pi * 6**3, rel=0.01)
     with pytest.raises(ValueError, match="does not fit into its box"):
         meshed(solid, (18, 22, 26))
+
+
+def test_uncertainties_follow_their_limits(few, monkeypatch):
+    assert register(few[:3]).uncertainties == ()
+    monkeypatch.setattr(module, "LARGEST_SIGMA_ROTATION_DEG", 0.0)
+    monkeypatch.setattr(module, "is_ambiguous", lambda _: True)
+    found = register(few[:3])
+    assert all(edge.undecided for edge in found.edges)
+    assert [u.frame for u in found.uncertainties] == list(found.names)
+    for said in found.uncertainties:  # several pairs know more than the best of them, and less than as many like it
+        alone = [e.rotation_sigma_deg for e in found.edges if said.frame in e.frames]
+        assert min(alone) / np.sqrt(len(alone)) < said.sigma_deg < min(alone)

@@ -14,6 +14,7 @@ from sl_nerfstudio.registration.surfaces import (
     build_surface_map,
     frame_cloud,
     motion_by_pose_errors,
+    reliable_points,
     surface_tone,
 )
 from sl_nerfstudio.relative_pose import epipolar, estimation
@@ -313,3 +314,17 @@ def test_what_is_dark_oblique_or_small_has_no_tone():
     assert np.isnan(found[:, :60]).all() and np.isnan(found[70, 90]) and np.isfinite(found[76, 84])
     light[5:, 60:] = np.nan
     assert np.isnan(tone(light, RIGHT)).all()
+
+
+def test_a_highlight_is_not_a_tone():
+    """A surface without texture, under light and gloss, is nearly even."""
+    even, textured = (tone(returned(a, LEFT, 0.5), LEFT) for a in (np.ones((TONE_SIZE, TONE_SIZE)), texture(ball()[1])))
+    assert np.nanstd(even) < 0.1 * np.nanstd(textured)
+
+
+def test_unreliable_points_are_left_out_of_surfaces():
+    cloud = clouds_of(RIG, SIZE, noise=0.1)[0]
+    sigma = cloud.sigma_noise.copy()
+    sigma[:25] *= 100
+    good = reliable_points(replace(cloud, sigma_noise=sigma))
+    assert not good[:25].any() and good.mean() > 0.9

@@ -191,3 +191,21 @@ def test_the_loop_measures_what_torch_does(monkeypatch, device, seed):
         assert found.dtype == torch.float32
         assert torch.allclose(found[counts].double(), expected[counts], rtol=2e-4)
     assert (depth[80], sigma[80], weight[80]) == (1.0, 0.0, 0.0)
+
+
+def test_missing_decodings_leave_the_gradient_of_poses_finite(rays):
+    coords = rays.uv_projector.clone()
+    coords[1::5] = float("nan")
+    T = rays.T_scene_projector.clone().requires_grad_()
+    sum(losses(Sphere(0.4), replace(rays, uv_projector=coords, T_scene_projector=T)).values()).backward()
+    assert T.grad is not None and T.grad.isfinite().all()
+    assert T.grad[0].abs().max() > 0 and T.grad[1::5].abs().max() == 0
+
+
+def test_poses_that_learn_are_measured_with_gradients():
+    projector = Intrinsics.of(PINHOLE)
+    rays = some_rays(projector, 0).chosen(torch.arange(500) > 80)
+    rays.T_scene_projector.requires_grad_()
+    depth = _measured(rays, rays.uv_projector.isfinite().all(-1), projector, TENSOR_NOISE)[0]
+    (gradient,) = torch.autograd.grad(depth.sum(), rays.T_scene_projector)
+    assert (gradient.abs().amax((1, 2)) > 0).all()

@@ -9,8 +9,9 @@ import pytest
 
 from sl_nerfstudio.bundle_adjustment.covariance import JointCovariance
 from sl_nerfstudio.meshing.files import read_mesh
-from sl_nerfstudio.runs.export import COVARIANCE, export_run, read_covariance, write_covariance
+from sl_nerfstudio.runs.export import export_run
 from sl_nerfstudio.runs.export_settings import ExportSettings
+from sl_nerfstudio.runs.pose_covariance import COVARIANCE, read_covariance, write_covariance
 from sl_nerfstudio.scan import FileError, PoseSigma, Scan, read_pose_sigmas, read_unplaced
 
 from .ball_run import ball_scan, run_of

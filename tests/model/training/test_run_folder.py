@@ -147,3 +147,12 @@ def test_two_processes_do_not_write_to_one_folder(tmp_path):
 def test_a_place_that_cannot_be_written(place):
     with pytest.raises(UserError, match=r"cannot be written \((.|\n)*--output-dir"):
         take_folder(Path(place))
+
+
+@pytest.mark.slow
+def test_it_is_trained_further_with_other_settings_that_have_no_effect(scan_root, tmp_path):
+    train(settings(scan_root, tmp_path, steps=2))
+    further = settings(scan_root, tmp_path, steps=1, load_dir=folder_of(tmp_path) / "nerfstudio_models")
+    further.pipeline.model.eval_num_rays_per_chunk = 512
+    train(further)
+    assert last_state(folder_of(tmp_path))["step"] == 2
