@@ -35,10 +35,13 @@ def make_surroundings(scene: Scene, background: Background, rng: np.random.Gener
         number = int(rng.integers(2, 4))
         azimuth = rng.uniform(0, 2 * np.pi) + (np.arange(number) + rng.uniform(-0.3, 0.3, number)) * 2 * np.pi / number
         parts += [_board(scene, float(a), rng) for a in azimuth]
-    corners = np.concatenate(parts).reshape(-1, 3)
-    around = Scene("surroundings", corners, np.arange(len(corners)).reshape(-1, 3))
-    # the face's normal for each of its corners, so that shading keeps the edges sharp
-    return replace(around, vertex_normals=np.repeat(around.face_normals, 3, axis=0))
+    return _faceted("surroundings", np.concatenate(parts))
+
+
+def _faceted(name: str, corners: Float[ndarray, "f 3 3"]) -> Scene:
+    """Triangles whose corners have the normal of their face, so that shading keeps the edges sharp."""
+    scene = Scene(name, corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
+    return replace(scene, vertex_normals=np.repeat(scene.face_normals, 3, axis=0))
 
 
 def above_the_table(scene: Scene) -> Scene:

@@ -7,7 +7,7 @@ import numpy as np
 
 from sl_nerfstudio.synthesis.config import SynthConfig
 from sl_nerfstudio.synthesis.devices import DISTANCE, DevicePair, _rig, look_at
-from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, _box, _flat_normals, visible_centres
+from sl_nerfstudio.synthesis.render import FrameGeometry, RayCaster, _box, _faceted, visible_centres
 from sl_nerfstudio.synthesis.scenes import Scene
 from sl_nerfstudio.synthesis.synthesise import make_setup
 from tests.processing.ramp_scan import RampScan, make_captures
@@ -73,5 +73,4 @@ def _room(scene: Scene) -> Scene:
         _box(centre + np.array([-1.35, -0.4, 0.1]) * size, np.array([0.03, 1.7, 1.0]) * size, 0.3),
         _box(centre + np.array([-0.85, 0.75, -0.2]) * size, np.array([0.16, 0.2, 0.3]) * size, 0.9),
     ])  # fmt: skip
-    vertices = corners.reshape(-1, 3)
-    return Scene("room", vertices, np.arange(len(vertices)).reshape(-1, 3), _flat_normals(corners))
+    return _faceted("room", corners)

@@ -6,7 +6,6 @@ import re
 from dataclasses import asdict, replace
 from datetime import datetime
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
@@ -15,7 +14,7 @@ import pytest
 from PIL import Image
 
 from sl_nerfstudio.evaluation import judgement, report
-from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement
+from sl_nerfstudio.evaluation.agreement import CaptureAgreement, FrameAgreement, FramePixels
 from sl_nerfstudio.evaluation.evaluate import EvaluationInputs, Length, evaluate
 from sl_nerfstudio.evaluation.judgement import judge
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
@@ -276,11 +275,15 @@ def test_thumbnails_show_every_frame_in_order(scan: Scan) -> None:
 
 
 def test_brightness_is_matched_in_least_squares() -> None:
-    rendered, lit = np.random.default_rng(0).random(50), np.arange(50) < 40
-    pixels: Any = SimpleNamespace(lit=lit, rendered=rendered, captured=np.where(lit, 1.7 * rendered, 9.0))
+    n, rendered = 50, np.random.default_rng(0).random(50)
+    flags, ones, pairs = np.ones(n, dtype=bool), np.ones(n), np.ones((n, 2))
+    pixels = FramePixels(
+        row=np.arange(n), column=np.arange(n), stride=1, hit=flags, lit=np.arange(n) < 40, decoded=flags, coords=pairs,
+        offset=pairs, epipolar=ones, captured=np.where(np.arange(n) < 40, 1.7 * rendered, 9.0), rendered=rendered,
+        depth_per_px=ones, ray_angle_deg=ones, behind=ones, noise_px=0.1, footprint_px=1.0,
+    )  # fmt: skip
     assert brightness_ratio(pixels) == pytest.approx(1.7)  # unlit pixels do not count
-    pixels.lit = np.zeros(50, bool)
-    assert brightness_ratio(pixels) == 1.0
+    assert brightness_ratio(replace(pixels, lit=~flags)) == 1.0
 
 
 def test_the_overlap_graph_is_a_drawing_with_every_frame_and_edge() -> None:
