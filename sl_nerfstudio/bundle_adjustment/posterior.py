@@ -215,9 +215,9 @@ def _numbers(
 # A covariance holds where residuals grow in proportion to a motion. Where few details hold a frame, as the holes of a
 # flange hold it about its axis, it leaves them after some tenths of a degree; farther on, look-ups contradict as they
 # do anywhere, and the likelihood may rise again. So it is asked on both sides, 4, 8, 16... sigma away (a slice of the
-# likelihood: Pawitan, In All Likelihood, 2001, section 3.4), of many pixels of the frame. A place s away whose look-
-# ups are preferred by z standard errors counts exp(z s / sigma): on a parabola whose maximum has the standard error
-# sigma, those of the right place would be preferred by s / (2 sigma).
+# likelihood: Pawitan, In All Likelihood, 2001, section 3.4), of many pixels of the frame. A place s away whose
+# look-ups are preferred by z standard errors counts exp(z s / sigma): on a parabola whose maximum has the standard
+# error sigma, those of the right place would be preferred by s / (2 sigma).
 
 _FIRST_SIGMAS = 4.0  # distance at which a frame is tried first; then twice as far each time
 _PRIOR_SIGMAS = 2.0  # uncertainties of the starting pose up to which it is

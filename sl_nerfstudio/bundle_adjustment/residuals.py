@@ -34,6 +34,7 @@ from sl_nerfstudio.geometry.lie import (
     inverse_poses,
     moved,
     moved_poses,
+    rotated,
     row_times_rotation,
 )
 from sl_nerfstudio.parallel import compiled, compiled_range
@@ -136,16 +137,6 @@ def _by_increment(out, first, sign, a, b, c, x, y, z):
 
 
 @compiled
-def _rotated(R, v):
-    """R v, for the rotation of a pose."""
-    return (
-        R[0, 0] * v[0] + R[0, 1] * v[1] + R[0, 2] * v[2],
-        R[1, 0] * v[0] + R[1, 1] * v[1] + R[1, 2] * v[2],
-        R[2, 0] * v[0] + R[2, 1] * v[1] + R[2, 2] * v[2],
-    )
-
-
-@compiled
 def _world_point(devices, frame, depth, ray):
     """A point along a camera ray."""
     return moved(devices[0][frame], depth * ray[0], depth * ray[1], depth * ray[2])
@@ -204,8 +195,8 @@ def cross_residuals(
         if derivatives:
             by_normal = residual[k, 0] ** 2 + residual[k, 1] ** 2 < own_place**2
             R, C, normal = T_world_camera[i], T_world_camera[j], normals[n]
-            dx, dy, dz = _rotated(R, ray)
-            nx, ny, nz = _rotated(R, normal)
+            dx, dy, dz = rotated(R, ray[0], ray[1], ray[2])
+            nx, ny, nz = rotated(R, normal[0], normal[1], normal[2])
             facing = nx * (C[0, 3] - x) + ny * (C[1, 3] - y) + nz * (C[2, 3] - z)
             along = -max(facing, GRAZING * np.sqrt(xj * xj + yj * yj + zj * zj))  # the normal times the camera's ray
             _, _, _, cux, cuy, cuz, cvx, cvy, cvz = view_of(camera_code, xj, yj, zj, cameras[j])

@@ -380,7 +380,7 @@ class SequenceLight:
 def decode_gray_code(images: Sequence[Image], layout: GrayCode) -> Decoded:
     """Coordinates of every pixel from the photographs of one sequence, in the order of `layout`.
 
-    Layer or RGB, 8 or 16 bit, all of one size. Coordinates are finer than a cell: they use the places where
+    Grey or RGB, 8 or 16 bit, all of one size. Coordinates are finer than a cell: they use the places where
     the difference of an image and its inverse changes sign, and sines where there are any. Raises DecodingError if the
     sequence is incomplete, if its images have several sizes, or if nothing can be decoded.
     """

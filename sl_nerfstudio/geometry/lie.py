@@ -352,6 +352,22 @@ def moved(T, x, y, z):
 
 
 @compiled
+def rotated(R, x, y, z):
+    """A vector under a rotation, or under the rotation of a rigid motion."""
+    return (
+        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
+        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
+        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
+    )
+
+
+@compiled
+def cross(a, b, c, x, y, z):
+    """The cross product of two vectors."""
+    return b * z - c * y, c * x - a * z, a * y - b * x
+
+
+@compiled
 def row_times_rotation(a, b, c, T):
     """A row vector times the rotation of a rigid motion."""
     return (

@@ -19,11 +19,10 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.geometry.devices import for_loops, pixel_of
-from sl_nerfstudio.geometry.lie import Similarities, Similarity, moved
+from sl_nerfstudio.geometry.lie import Similarities, Similarity, moved, rotated
 from sl_nerfstudio.geometry.numerics import geman_mcclure_weight
 from sl_nerfstudio.parallel import compiled, compiled_range, compiled_sums
 from sl_nerfstudio.registration.surfaces import SurfaceMap
-from sl_nerfstudio.relative_pose.epipolar import rotated
 
 COARSE_POINTS = 400  # of each frame, wherever many pairs are compared
 AGREEING_SIGMAS = 4.0  # standard deviations of the two surfaces within which a point agrees

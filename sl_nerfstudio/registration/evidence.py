@@ -20,7 +20,7 @@ from numpy import ndarray
 from scipy.ndimage import uniform_filter
 
 from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of
-from sl_nerfstudio.geometry.lie import Similarities, Similarity, row_times_rotation
+from sl_nerfstudio.geometry.lie import Similarities, Similarity, cross, rotated, row_times_rotation
 from sl_nerfstudio.parallel import both, compiled, compiled_range
 from sl_nerfstudio.registration.agreement import (
     AGREEING_SIGMAS,
@@ -39,7 +39,6 @@ from sl_nerfstudio.registration.surfaces import (
     centre_and_radius,
     find_empty_places,
 )
-from sl_nerfstudio.relative_pose.epipolar import cross, rotated
 
 LARGEST_SIDE = 640  # places of the lattice along the image's longer side
 POINTS = 2000  # of a frame that are compared, about

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import softmax
 
 from sl_nerfstudio.geometry.devices import for_loops, pixel_of
-from sl_nerfstudio.geometry.lie import Similarity, angle_deg
+from sl_nerfstudio.geometry.lie import Similarity, angle_deg, rotated
 from sl_nerfstudio.parallel import compiled_range
 from sl_nerfstudio.registration.agreement import (
     AGREEING_SIGMAS,
@@ -43,7 +43,6 @@ from sl_nerfstudio.registration.evidence import (
     Places,
 )
 from sl_nerfstudio.registration.surfaces import SurfaceMap
-from sl_nerfstudio.relative_pose.epipolar import rotated
 
 Sides = tuple[Side, Side]  # of the source and the target
 

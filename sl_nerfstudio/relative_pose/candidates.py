@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.lie import cross, rotated
 from sl_nerfstudio.geometry.numerics import geman_mcclure_cost
 from sl_nerfstudio.parallel import compiled, compiled_sums
 from sl_nerfstudio.relative_pose.epipolar import (
@@ -27,10 +28,8 @@ from sl_nerfstudio.relative_pose.epipolar import (
     EpipolarFit,
     RayPairs,
     UnitPose,
-    cross,
     distance_from_curve,
     fit_epipolar,
-    rotated,
     sampson,
     subsample,
 )

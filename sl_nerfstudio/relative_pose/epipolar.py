@@ -19,7 +19,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, for_loops, ray_of, view_of
 from sl_nerfstudio.geometry.least_squares import NormalEquations, minimise
-from sl_nerfstudio.geometry.lie import row_times_rotation
+from sl_nerfstudio.geometry.lie import cross, rotated, row_times_rotation
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import compiled
 
@@ -187,22 +187,6 @@ def sampson_jacobian(
     A = direction_basis(t)[:, ::-1] * [1, -1]
     _derivatives(np.ascontiguousarray(R), t, A, rays.d_camera, rays.d_projector, rays.d_projector_by_uv, r, J)
     return r, J
-
-
-@compiled
-def rotated(R, x, y, z):
-    """A vector under a rotation, or under the rotation of a rigid motion."""
-    return (
-        R[0, 0] * x + R[0, 1] * y + R[0, 2] * z,
-        R[1, 0] * x + R[1, 1] * y + R[1, 2] * z,
-        R[2, 0] * x + R[2, 1] * y + R[2, 2] * z,
-    )
-
-
-@compiled
-def cross(a, b, c, x, y, z):
-    """The cross product of two vectors."""
-    return b * z - c * y, c * x - a * z, a * y - b * x
 
 
 @compiled
