@@ -129,7 +129,7 @@ def test_two_processes_do_not_write_into_the_same_file(tmp_path: Path) -> None:
 
 
 def write_often(path: Path, number: int) -> None:
-    for _ in range(100):
+    for _ in range(40):
         try:
             write_atomic(path, bytes([number]) * 20_000)
         except UserError as error:
@@ -138,7 +138,7 @@ def write_often(path: Path, number: int) -> None:
 
 
 def test_many_processes_that_write_one_file_never_leave_half_of_it(tmp_path: Path) -> None:
-    processes = [fork(write_often, tmp_path / "a", k) for k in range(6)]
+    processes = [fork(write_often, tmp_path / "a", k) for k in range(4)]
     while any(process.is_alive() for process in processes):
         if (tmp_path / "a").exists():
             content = (tmp_path / "a").read_bytes()

@@ -133,15 +133,18 @@ def choose_frames(first, last, visible, starts, seed, number, frames):
 
 def place_anchors(rig: Rig, maps: CoordinateMaps, per_frame: int, generator: torch.Generator) -> Anchors:
     """Random decoded pixels whose neighbourhood is smooth and whose rays meet in front of both devices."""
-    anchors, good = anchors_at(rig, maps, *maps.draw(torch.arange(rig.frames), per_frame, generator))
+    frame, uv = maps.draw(torch.arange(rig.frames), per_frame, generator)
+    anchors, good = anchors_at(rig, frame, uv, maps.look_up(frame, uv))
     return anchors.chosen(good)
 
 
 def anchors_at(
-    rig: Rig, maps: CoordinateMaps, frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"]
+    rig: Rig, frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"], seen: MapSample
 ) -> tuple[Anchors, Bool[Tensor, "n"]]:
-    """Anchors at decoded pixels; whether the neighbourhood is smooth and the rays meet in front of both devices."""
-    seen = maps.look_up(frame, uv)
+    """Anchors at decoded pixels; whether the neighbourhood is smooth and the rays meet in front of both devices.
+
+    `seen` is what was decoded there.
+    """
     p, normal, good = _surface(rig, frame, uv, seen)
     depth = p.norm(dim=-1)
     return Anchors(frame, p / depth[:, None], seen.uv_projector, depth, normal, seen.roughness), seen.valid & good

@@ -8,15 +8,15 @@ anchor is the same pixel of the same frame, at the depth that each rig gives it,
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import exp, pi
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
+from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
 from sl_nerfstudio.bundle_adjustment.observations import anchors_at, in_front_of, observe, partners
 from sl_nerfstudio.bundle_adjustment.parameters import (
@@ -93,61 +93,67 @@ def odds(problem: SearchProblem, one: Rig, two: Rig, noise: float) -> Odds:
     """
     generator = torch.Generator().manual_seed(problem.settings.seed)
     frame, uv = problem.maps.draw(torch.arange(one.frames), _COMPARED_ANCHORS, generator)
-    gain, block, common = _gains(problem.maps, (one, two), noise, frame, uv, generator)
+    seen = problem.maps.look_up(frame, uv)
+    (mine, good), (theirs, as_good) = (anchors_at(rig, frame, uv, seen) for rig in (one, two))
+    ends = [_End(one, mine, good & as_good), _End(two, theirs, good & as_good)]
+    allowed = torch.stack([end.partners(problem.maps, generator) for end in ends]).any(0)
+    numbers = [end.numbers(problem.maps, allowed, generator) for end in ends]
+    rows = _common(one.frames, *numbers, EVERY_FRAME_PER_ANCHOR * int(ends[0].good.sum()), generator)
+    gain, block, common = _gains(problem.maps, ends, rows, noise, uv)
     share = min(INDEPENDENT * one.frames / max(common, 1), 1.0)
     mean, error = mean_and_error(share * gain, block)
     prior = prior_cost(problem.prior, problem.start, two) - prior_cost(problem.prior, problem.start, one)
     return Odds(mean * len(gain), prior, error * len(gain))
 
 
-def frame_lead(
-    problem: SearchProblem, one: Rig, two: Rig, noise: float, frame: int,
-    pixels: tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]],
-) -> float:  # fmt: skip
-    """By how many of its standard errors one rig is more probable than another that differs by a single frame.
+@dataclass(frozen=True)
+class _End:
+    """A rig, and decoded pixels as its anchors."""
 
-    By the look-ups alone, of many decoded `pixels` of that frame, and of some of those of the others (see
-    `many_pixels`).
-    """
-    owner, uv = pixels
-    chosen = owner == frame
-    chosen[:: max(_OF_OTHERS, one.frames)] = True
-    generator = torch.Generator().manual_seed(problem.settings.seed)
-    gain, block, _ = _gains(problem.maps, (one, two), noise, owner[chosen], uv[chosen], generator, frame)
-    mean, error = mean_and_error(gain, block)
-    return mean / error if error > 0 else 0.0
+    rig: Rig
+    anchors: Anchors
+    good: Bool[Tensor, "anchors"]  # those that can be used
+
+    def partners(self, maps: CoordinateMaps, generator: torch.Generator) -> Bool[Tensor, "frames frames"]:
+        return partners(self.rig, self.anchors.chosen(self.good), maps, PARTNERS, LEAST_COSINE, generator)
+
+    def numbers(
+        self, maps: CoordinateMaps, allowed: Bool[Tensor, "frames frames"], generator: torch.Generator
+    ) -> Int[Tensor, "rows"]:
+        """Every look-up as one number: of its anchor, then of the frame that looks it up."""
+        index, n = self.good.nonzero()[:, 0], self.rig.frames
+        anchors = self.anchors.chosen(index)
+        rows = observe(self.rig, anchors, maps, n, float("inf"), LEAST_COSINE, generator, allowed)
+        return index[rows.anchor] * n + rows.frame
 
 
-def many_pixels(problem: SearchProblem) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]]:
-    """Many decoded pixels of every frame: whose they are, and where."""
-    generator = torch.Generator().manual_seed(problem.settings.seed)
-    return problem.maps.draw(torch.arange(problem.start.frames), _FRAME_ANCHORS, generator)
+def _common(
+    frames: int, first: Int[Tensor, "n"], second: Int[Tensor, "m"], most: int, generator: torch.Generator
+) -> Observations:
+    """Look-ups, by their numbers, that exist at both of two rigs; a random choice if there are too many."""
+    common = first[torch.isin(first, second)]
+    chosen = common[torch.randperm(len(common), generator=generator)[:most].sort().values]
+    return Observations(chosen // frames, chosen % frames)
 
 
 def _gains(
-    maps: CoordinateMaps, rigs: tuple[Rig, Rig], noise: float, frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"],
-    generator: torch.Generator, only: int | None = None,
-) -> tuple[Float[Tensor, "gains"], Int[Tensor, "gains"], int]:  # fmt: skip
+    maps: CoordinateMaps, ends: list[_End], rows: Observations, noise: float, uv: Float[Tensor, "anchors 2"]
+) -> tuple[Float[Tensor, "gains"], Int[Tensor, "gains"], int]:
     """What the first of two rigs gains over the second, nats, with the block of the image of each gain.
 
     Gains of the decoded pixels' own residuals, then of look-ups that exist at both; and the number of the latter.
-    `only`: the frame that these involve, as anchor or as viewer.
     """
-    (mine, good), (theirs, as_good) = (anchors_at(rig, maps, frame, uv) for rig in rigs)
-    both = good & as_good
-    ends = [(rigs[0], mine.chosen(both)), (rigs[1], theirs.chosen(both))]
-    rows = _common(maps, ends, generator, only)
-    found = [residuals_of(rig, anchors, rows, maps) for rig, anchors in ends]
-    width = _COMPARED_NOISES * noise
+    found = [residuals_of(end.rig, end.anchors, rows, maps) for end in ends]
+    width, both = _COMPARED_NOISES * noise, ends[0].good & ends[1].good
     common = found[0].cross_valid & found[1].cross_valid
-    for (rig, anchors), r in zip(ends, found, strict=True):
+    for end, r in zip(ends, found, strict=True):
         far = (common & (r.cross.norm(dim=-1) > _HIDDEN * width)).nonzero()[:, 0]
-        hidden = in_front_of(rig, anchors, Observations(rows.anchor[far], rows.frame[far]), maps)
+        hidden = in_front_of(end.rig, end.anchors, Observations(rows.anchor[far], rows.frame[far]), maps)
         common[far[hidden]] = False
-    costs = [geman_mcclure_cost((torch.cat([r.own, r.cross[common]]) / width).square().sum(-1)) for r in found]
-    cell = (uv[both] / _BLOCK).long()
-    block = (frame[both] * _MOST_CELLS + cell[:, 1]) * _MOST_CELLS + cell[:, 0]
-    return _NATS * (costs[1] - costs[0]), torch.cat([block, block[rows.anchor[common]]]), int(common.sum())
+    costs = [geman_mcclure_cost((torch.cat([r.own[both], r.cross[common]]) / width).square().sum(-1)) for r in found]
+    cell = (uv / _BLOCK).long()
+    block = (ends[0].anchors.frame * _MOST_CELLS + cell[:, 1]) * _MOST_CELLS + cell[:, 0]
+    return _NATS * (costs[1] - costs[0]), torch.cat([block[both], block[rows.anchor[common]]]), int(common.sum())
 
 
 def prior_cost(prior: PosePrior, start: Rig, rig: Rig) -> float:
@@ -186,30 +192,6 @@ def mean_and_error(values: Float[Tensor, "n"], block: Int[Tensor, "n"]) -> tuple
     return float(mean), float((blocks / (blocks - 1) * (sums**2).sum()).sqrt() / len(values))
 
 
-def _common(
-    maps: CoordinateMaps, ends: list[tuple[Rig, Anchors]], generator: torch.Generator, only: int | None
-) -> Observations:
-    """Anchors in frames that see them at both ends; a random choice of these if there are too many."""
-    allowed = torch.stack([partners(*end, maps, PARTNERS, LEAST_COSINE, generator) for end in ends]).any(0)
-    if only is not None:
-        frame = torch.arange(len(allowed)) == only
-        allowed &= frame | frame[:, None]
-    first, second = (_numbers(maps, *end, allowed, generator) for end in ends)
-    common = first[torch.isin(first, second)]
-    most = EVERY_FRAME_PER_ANCHOR * len(ends[0][1].frame) if only is None else _FRAME_LOOK_UPS
-    chosen = common[torch.randperm(len(common), generator=generator)[:most].sort().values]
-    frames = ends[0][0].frames
-    return Observations(chosen // frames, chosen % frames)
-
-
-def _numbers(
-    maps: CoordinateMaps, rig: Rig, anchors: Anchors, allowed: Tensor, generator: torch.Generator
-) -> Int[Tensor, "rows"]:
-    """Every look-up of an end as one number: of its anchor, then of the frame that looks it up."""
-    rows = observe(rig, anchors, maps, rig.frames, float("inf"), LEAST_COSINE, generator, allowed)
-    return rows.anchor * rig.frames + rows.frame
-
-
 # How far single frames may have slid: the likelihood along the motion in which each is known least.
 #
 # A covariance holds where residuals grow in proportion to a motion. Where few details hold a frame, as the holes of a
@@ -233,24 +215,81 @@ def with_slides(
     """The covariance's factor, wider by how far some of the frames may have slid, each by itself."""
     n, rig = found.state.rig.frames, found.state.rig
     directions, pixels = least_known_motions(problem, refine, found), many_pixels(problem)
-    motions, asked = torch.zeros(len(frames), 2, n, 6, dtype=torch.float64), []
-    for motion, k in zip(motions, frames, strict=True):
-        motion[:, k] = directions[k].reshape(2, 6)
+    motions = torch.zeros(len(frames), 2, n, 6, dtype=torch.float64)
+
+    def slid(motion: Float[Tensor, "2 frames 6"], k: int) -> float:
+        place = PlaceOfFrame.of(problem, rig, found.noise, k, pixels)
         sigma = float((motion.flatten() @ factor[: 12 * n]).norm())
         prior = float((directions[k] / problem.prior.sigma[k]).norm().reciprocal())
-        asked.append(partial(how_far, partial(_lead_at, problem, rig, found.noise, k, motion, pixels), sigma, prior))
-    sizes = torch.tensor(results(asked), dtype=torch.float64)
-    columns = (sizes[:, None] * motions.flatten(1)).mT[:, sizes > 0]
+        return how_far(lambda d: place.lead_of(rig.moved(d * motion[0], d * motion[1])), sigma, prior)
+
+    for motion, k in zip(motions, frames, strict=True):
+        motion[:, k] = directions[k].reshape(2, 6)
+    sizes = results([partial(slid, motion, k) for motion, k in zip(motions, frames, strict=True)])
+    columns = torch.tensor(sizes, dtype=torch.float64)[:, None] * motions.flatten(1)
+    columns = columns.mT[:, torch.tensor(sizes) > 0]
     return torch.cat([factor, torch.nn.functional.pad(columns, (0, 0, 0, len(factor) - 12 * n))], 1)
 
 
-def _lead_at(
-    problem: SearchProblem, rig: Rig, noise: float, frame: int, motion: Float[Tensor, "2 frames 6"],
-    pixels: tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]], distance: float,
-) -> float:  # fmt: skip
-    """By how many standard errors look-ups prefer a frame at a distance along a motion to where it is."""
-    moved = rig.moved(distance * motion[0], distance * motion[1])
-    return frame_lead(problem, moved, rig, noise, frame, pixels)
+def many_pixels(problem: SearchProblem) -> tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]]:
+    """Many decoded pixels of every frame: whose they are, and where."""
+    generator = torch.Generator().manual_seed(problem.settings.seed)
+    return problem.maps.draw(torch.arange(problem.start.frames), _FRAME_ANCHORS, generator)
+
+
+@dataclass(frozen=True)
+class PlaceOfFrame:
+    """The place of one frame in a rig, with which its other places are compared.
+
+    By the look-ups alone, of many decoded pixels of that frame, and of some of those of the others.
+    """
+
+    problem: SearchProblem
+    noise: float  # of one look-up, projector pixels
+    here: _End
+    uv: Float[Tensor, "anchors 2"]  # the anchors' pixels
+    mine: Int[Tensor, "m"]  # anchors of the frame
+    seen: MapSample  # what was decoded at those
+    allowed: Bool[Tensor, "frames frames"]  # which frames look up whose anchors
+    numbers: Int[Tensor, "rows"]  # of the look-ups here
+
+    @staticmethod
+    def of(
+        problem: SearchProblem, rig: Rig, noise: float, frame: int,
+        pixels: tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]],
+    ) -> "PlaceOfFrame":  # fmt: skip
+        """`pixels` are the `many_pixels` of all frames."""
+        owner, uv = pixels
+        chosen = owner == frame
+        chosen[:: max(_OF_OTHERS, rig.frames)] = True
+        owner, uv = owner[chosen], uv[chosen]
+        mine, maps = (owner == frame).nonzero()[:, 0], problem.maps
+        here = _End(rig, *anchors_at(rig, owner, uv, maps.look_up(owner, uv)))
+        generator = torch.Generator().manual_seed(problem.settings.seed)
+        its = torch.arange(rig.frames) == frame
+        allowed = here.partners(maps, generator) & (its | its[:, None])
+        numbers = here.numbers(maps, allowed, generator)
+        seen = maps.look_up(owner[mine], uv[mine])
+        return PlaceOfFrame(problem, noise, here, uv, mine, seen, allowed, numbers)
+
+    def lead_of(self, other: Rig) -> float:
+        """By how many of its standard errors a rig in which that frame alone is elsewhere is more probable."""
+        maps, generator = self.problem.maps, torch.Generator().manual_seed(self.problem.settings.seed)
+        frame = self.here.anchors.frame[self.mine]
+        there = _End(other, *self._moved(*anchors_at(other, frame, self.uv[self.mine], self.seen)))
+        numbers = there.numbers(maps, self.allowed, generator)
+        rows = _common(other.frames, self.numbers, numbers, _FRAME_LOOK_UPS, generator)
+        gain, block, _ = _gains(maps, [there, self.here], rows, self.noise, self.uv)
+        mean, error = mean_and_error(gain, block)
+        return mean / error if error > 0 else 0.0
+
+    def _moved(self, mine: Anchors, good: Bool[Tensor, "m"]) -> tuple[Anchors, Bool[Tensor, "anchors"]]:
+        """All anchors, with those of the frame where they are at another place of it."""
+        anchors = replace(self.here.anchors, **{
+            name: getattr(self.here.anchors, name).index_copy(0, self.mine, getattr(mine, name))
+            for name in ("d_camera", "depth", "normal")
+        })  # fmt: skip
+        return anchors, self.here.good.index_copy(0, self.mine, good)
 
 
 def least_known_motions(

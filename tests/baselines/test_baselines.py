@@ -37,6 +37,7 @@ def true_poses(scan: Scan) -> DevicePoses:
     return poses
 
 
+@pytest.mark.slow
 def test_fusion_with_true_poses_is_as_good_as_its_voxels_and_registration_repairs_the_frames(disturbed: Scan) -> None:
     true, initial = true_poses(disturbed), disturbed.poses
     registered = register(disturbed, initial)

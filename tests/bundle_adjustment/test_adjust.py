@@ -124,6 +124,7 @@ class SpoiltMaps(ExactMaps):
         return replace(found, uv_projector=found.uv_projector + offset)
 
 
+@pytest.mark.slow
 def test_wrong_cells_do_not_spoil_it(true, exact):
     """3 % of the cells of 5 x 5 pixels."""
     cells = torch.rand(FRAMES, SIZE // 5, SIZE // 5, generator=torch.Generator().manual_seed(0)) < 0.03

@@ -129,6 +129,7 @@ def test_searches_that_end_elsewhere_and_are_less_probable_are_other_ends_until_
     assert all(a is b for a, b in zip(found.others, ends, strict=True))
 
 
+@pytest.mark.slow
 def test_ends_as_probable_widen_the_covariance_by_what_they_differ_and_others_by_nothing(true, exact, first):
     """Along the directions in which they differ, whatever is said there already."""
     problem = problem_of(true, exact, rough_prior(FRAMES, 3.0), ASKED)

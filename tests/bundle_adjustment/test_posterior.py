@@ -13,7 +13,7 @@ from sl_nerfstudio.bundle_adjustment.adjust import adjust
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps
 from sl_nerfstudio.bundle_adjustment.parameters import UNKNOWNS, USUAL_FRAME_ROTATION_DEG
 from sl_nerfstudio.bundle_adjustment.posterior import (
-    frame_lead,
+    PlaceOfFrame,
     how_far,
     least_known_motions,
     many_pixels,
@@ -203,15 +203,16 @@ def test_the_place_of_a_frame_leads_where_details_say_so_and_both_ways_alike(rou
         leads: list[tuple[float, float]] = []
         for problem, found in (round_scene, held_scene):
             forth, back = (
-                frame_lead(problem, *rigs, found.noise, 2, many_pixels(problem))
-                for rigs in ((rig, there), (there, rig))
+                PlaceOfFrame.of(problem, other, found.noise, 2, many_pixels(problem)).lead_of(one)
+                for one, other in ((rig, there), (there, rig))
             )
             leads.append((forth, back))
         for forth, back in leads:
             assert forth == pytest.approx(-back, abs=1e-9)
         assert abs(leads[0][0]) < 1 < leads[1][0]
         assert [forth for forth, _ in leads] == sorted(forth for forth, _ in leads)
-    assert frame_lead(held_scene[0], rig, rig, held_scene[1].noise, 2, many_pixels(held_scene[0])) == 0
+    problem, found = held_scene
+    assert PlaceOfFrame.of(problem, rig, found.noise, 2, many_pixels(problem)).lead_of(rig) == 0
 
 
 @given(st.floats(1e-4, 1.0), st.floats(5.0, 500.0))

@@ -40,12 +40,11 @@ def solved(scene, free, model="OPENCV", points=POINTS):
     ("camera", "projector", "free"),
     [
         (CAMERA, PROJECTOR, (TWO, ONE)),
-        (PLAIN_CAMERA, DOE, (PLAIN, PLAIN)),
-        (TANGENTIAL, PLAIN_PROJECTOR, (ALL, PLAIN)),
+        pytest.param(TANGENTIAL, PLAIN_PROJECTOR, (ALL, PLAIN), marks=pytest.mark.slow),
         (CAMERA, None, (TWO,)),
         (TANGENTIAL, replace(DOE, k1=0.1), (ALL, ALL)),
     ],
-    ids=["lens shift", "DOE", "tangential", "camera alone", "all of DOE"],
+    ids=["lens shift", "tangential", "camera alone", "all of DOE"],
 )
 def test_exact_corners_give_the_exact_devices_and_poses(camera, projector, free):
     scene = make_scene(1, count=4, camera=camera, projector=projector)
@@ -57,8 +56,7 @@ def test_exact_corners_give_the_exact_devices_and_poses(camera, projector, free)
     np.testing.assert_allclose(found.rig.T_projector_camera, scene.truth.T_projector_camera, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("aspect", [0.5, 0.7, 1.5, 2.0])
-@pytest.mark.parametrize("device", ["camera", "projector"])
+@pytest.mark.parametrize(("device", "aspect"), [("camera", 0.7), ("projector", 0.5), ("projector", 2.0)])
 def test_pixels_need_not_be_square(device, aspect):
     """A projector of 912 x 1140 diamond pixels has fl_y = 2 fl_x; the field of view stays that of square ones."""
 
@@ -83,6 +81,7 @@ def test_the_unit_of_the_board_changes_lengths_alone():
     np.testing.assert_allclose(m.rig.T_camera_board[:, :3, 3] * 1e3, mm.rig.T_camera_board[:, :3, 3], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_corners_that_are_wrong_do_not_matter():
     scene, rng = make_scene(3, count=6, noise=0.1), np.random.default_rng(0)
 

@@ -157,6 +157,7 @@ def capture_twice(path):
         captures.add_sequence([IMAGE, 255 - IMAGE])
 
 
+@pytest.mark.slow
 def test_what_a_killed_command_leaves_is_complete_and_is_continued(tmp_path):
     for moment in range(40):
         was_killed = killed_at_change(moment, capture_twice, tmp_path)

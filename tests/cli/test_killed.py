@@ -33,6 +33,7 @@ def content(root):
 
 
 @each_command
+@pytest.mark.slow
 def test_after_a_kill_at_any_moment_the_same_command_succeeds(tmp_path, command):
     whole, broken = tmp_path / "whole", tmp_path / "broken"
     run(command, whole)

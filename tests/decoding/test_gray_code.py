@@ -71,6 +71,7 @@ def test_colour_and_16_bit_give_the_same(images, decoded):
         ({"gain": 3.0, "blur": 0.8}, 1, "overexposed", 0.05),
     ],
 )
+@pytest.mark.slow
 def test_stripes_that_are_not_resolved_are_not_used_and_overexposure_is_named(light, size, note, largest_error):
     coords, layout = exact_coords(400, 300), GrayCode(640, 480, 1)
     decoded = decode_gray_code(photographs(coords, layout=layout, **light), layout)
@@ -81,6 +82,7 @@ def test_stripes_that_are_not_resolved_are_not_used_and_overexposure_is_named(li
     assert np.median(error) < largest_error and (error.max(1) < 1.5 * size).mean() > 0.99
 
 
+@pytest.mark.slow
 def test_a_textured_figure_before_a_wall():
     """Colour photographs of which a comparison of each image with its inverse alone gives the wall to 0.8 px."""
     layout = GrayCode.in_order("opencv", 1280, 800, 1)

@@ -67,6 +67,7 @@ def test_light_is_what_the_surface_returns_of_the_projectors(decoder, decoded, t
 
 
 @pytest.mark.parametrize(("scale", "factor"), [(3.2, 5), (0.9, 1)])
+@pytest.mark.slow
 def test_a_photograph_is_shrunk_as_far_as_its_periods_allow(decoder, scale, factor):
     """Whatever it is enlarged by, and wherever its grid is first looked for."""
     shown = np.rint(255 * decoder.pattern.render()[100:700, 50:750]).astype(np.uint8)
@@ -79,6 +80,7 @@ def test_a_photograph_is_shrunk_as_far_as_its_periods_allow(decoder, scale, fact
     assert np.isfinite(error).mean() > 0.9 and np.nanmedian(error) < 0.2
 
 
+@pytest.mark.slow
 def test_what_shows_no_grid_or_is_small_is_not_shrunk(decoder, image):
     assert decoder.shrink_factor(image) == 1
     noise = np.random.default_rng(0).integers(0, 255, (1300, 1300)).astype(np.uint8)
@@ -90,7 +92,7 @@ def test_the_shipped_weights_are_small():
     assert 0 < sum(path.stat().st_size for path in weights.iterdir()) < 15e6
 
 
-@pytest.mark.parametrize("turns", [1, 2, 3])
+@pytest.mark.parametrize("turns", [1, *(pytest.param(n, marks=pytest.mark.slow) for n in (2, 3))])
 def test_a_camera_held_on_its_side_or_upside_down(decoder, image, truth, turns):
     turned = decoder.decode(np.ascontiguousarray(np.rot90(image, turns)))
     coords = np.rot90(turned.coords, -turns)
@@ -99,6 +101,7 @@ def test_a_camera_held_on_its_side_or_upside_down(decoder, image, truth, turns):
     assert both.sum() > 0.85 * truth.mask.sum() and np.median(error) < 0.4 and (error > 10).mean() < 0.01
 
 
+@pytest.mark.slow
 def test_the_same_capture_again_in_colour_or_sixteen_bits_means_the_same(decoder, image, decoded):
     assert np.array_equal(decoder.decode(image).coords, decoded.coords, equal_nan=True)
     deep = image.astype(np.uint16) * 257

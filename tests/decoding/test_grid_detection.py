@@ -113,6 +113,7 @@ def causes_told(decoder, image):
         ("other", {"gain": 10.0}, {}, {"another pattern", "saturated"}),
     ],
 )
+@pytest.mark.slow
 def test_every_fault_is_told_and_none_is_made_up(decoders, radiance, decoder, fault, told, perhaps):
     assert set(told) <= causes_told(decoders[decoder], capture(radiance, **fault)) <= {*told, *perhaps}
 
@@ -126,6 +127,7 @@ def test_a_scene_without_the_pattern_is_out_of_view(decoders):
 
 
 @pytest.mark.parametrize("texture", ["checks", "noise", "bricks"])
+@pytest.mark.slow
 def test_texture_behind_the_object_is_no_reason_to_refuse(decoders, texture):
     truth = make_setup(SynthConfig(resolution=280, frames=2, seed=3)).render(1, 2)
     y, x = np.mgrid[:280, :280]

@@ -176,6 +176,7 @@ def test_the_step_that_is_chosen_is_the_best_of_the_possible_ones(rows):
     assert (odds[~can.any(0)] > 10).all() and 0.5 < can.any(0).mean() < 1
 
 
+@pytest.mark.slow
 def test_the_shipped_network_corrects_more_pixels_than_it_spoils_and_tells_which_are_wrong():
     """A frog before a table: coordinates before and after the choice, and the true ones."""
     truth = make_setup(SynthConfig(scene="frog", background="table", resolution=360, frames=2, seed=3)).render(0, 2)

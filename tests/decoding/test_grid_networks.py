@@ -45,6 +45,7 @@ def test_decoders_load_networks_late_and_are_sent_to_other_processes_without_the
     assert NetworkDecoder(GridPattern()).key == here.key
 
 
+@pytest.mark.slow
 def test_one_process_computes_for_all_others_what_each_would():
     shared = networks_for_all_processes("cpu")
     assert isinstance(shared, ImageNetworks) and isinstance(LoadedNetworks(), ImageNetworks)
@@ -120,6 +121,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_the_process_with_the_networks_ends_with_its_parent(tmp_path):
     script = tmp_path / "parent.py"
     script.write_text(_PARENT)

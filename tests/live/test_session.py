@@ -42,6 +42,7 @@ def without_seconds(rows):
     return [(r.name, r.state, r.cause, r.kept, r.anchor) for r in rows]
 
 
+@pytest.mark.slow
 def test_frames_that_add_something_are_kept_as_captures(whole):
     session, updates = whole
     kept = [WALK[k] for k, row in enumerate(session.rows) if row.kept >= 0]

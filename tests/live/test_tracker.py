@@ -66,6 +66,7 @@ def test_stated_uncertainty_covers_the_errors_against_the_frames_around(lap):
     assert np.quantile(ratios, 0.95) < 3
 
 
+@pytest.mark.slow
 def test_a_loss_is_said_with_its_cause_and_ends_where_the_object_is_seen_again():
     tracker, places = Tracker(), [0, 1, 2, 3]
     assert all(placed.state is State.TRACKED for placed in walk(tracker, [sights()[k] for k in places]))

@@ -59,6 +59,7 @@ def test_other_operations_are_recorded_anew(begin):
         assert recorder.recordings == 2 and float(last) == 2.0 * float(x) == 2.0 * (2 * WARM_UP + 6)
 
 
+@pytest.mark.slow
 def test_a_step_that_waits_is_not_recorded_and_training_goes_on(begin, capsys):
     with PretendedGpu(kernels=True) as gpu:
         graph = StepGraph(PretendedRecorder(gpu), lambda: float(torch.zeros((), device="cuda")))

@@ -36,8 +36,8 @@ def adjusted_at_once(scan, S_scene_world, samples, refine, prior, settings):
     [
         ("sl-neus", "off", "adjust", "torch"),  # fixed
         ("sl-neus", "free", "adjust", "triton"),  # refined before the first step
-        ("sl-neus", "rigid-rig", "render", "triton"),  # trained
-        ("sl-neus-paper", "free", "render-independently", "torch"),
+        pytest.param("sl-neus", "rigid-rig", "render", "triton", marks=pytest.mark.slow),  # trained
+        pytest.param("sl-neus-paper", "free", "render-independently", "torch", marks=pytest.mark.slow),
     ],
 )
 def test_no_step_waits_for_the_gpu(begin, monkeypatch, method, refine, poses, backend):

@@ -212,6 +212,7 @@ WRONG = [((640, 480, 2), "800x600"), ((640, 480, 2), "640x400"), ((1280, 800, 4)
 
 
 @pytest.mark.parametrize(("true", "stated"), WRONG)
+@pytest.mark.slow
 def test_a_resolution_that_the_codes_exclude_is_refused_and_the_likely_one_named(tmp_path, true, stated):
     layout = GrayCode(*true)
     for name in ("a", "b"):

@@ -77,6 +77,7 @@ def test_faulty_poses(tmp_path, frames, extra, message):
     assert "cause:" in str(caught.value) and "remedy:" in str(caught.value)
 
 
+@pytest.mark.slow
 def test_the_camera_is_refined_and_its_uncertainty_stated(ramp_scan, tmp_path):
     true = ramp_scan.camera
     rough = replace(true, fl_x=1.04 * true.fl_x, fl_y=1.04 * true.fl_y, cx=true.w / 2, cy=true.h / 2)

@@ -155,6 +155,7 @@ def test_a_mask_limits_everything_that_was_decoded(tmp_path):
         masks.applied(NAMES[0], Decoded(ones, np.ones(SIZE, bool), ones[..., 0]))
 
 
+@pytest.mark.slow
 def test_a_changed_mask_counts_in_the_next_run_and_needs_no_decoding(ramp_scan, ramps_registered, tmp_path):
     captures = find_captures(ramp_scan.root / "images", True)
     folder, work, seen = tmp_path / "m", tmp_path / "w", []

@@ -61,6 +61,7 @@ def run(on_a_table, tmp_path_factory):
     return result, read_scan(root / "s"), truth, "\n".join(log)
 
 
+@pytest.mark.slow
 def test_the_scan_holds_the_object_and_the_report_shows_what_was_left_out(run):
     result, scan, truth, log = run
     assert result.registered == len(NAMES) and check_scan(scan.root) == []
@@ -79,6 +80,7 @@ def test_the_scan_holds_the_object_and_the_report_shows_what_was_left_out(run):
     assert "object only: left out" in log and "plane with" in log
 
 
+@pytest.mark.slow
 def test_a_frame_that_shows_nothing_of_the_object_is_left_out_by_name(run, object_only):
     result = run[0]
     records = tuple(replace(result.frames[0], name=name) for name in "ab")

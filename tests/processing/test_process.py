@@ -255,6 +255,7 @@ def test_frames_are_registered_again_only_if_they_have_no_order_and_all_of_them_
     assert found.exclusions == ((doubt,) if unordered or compared_with_all else ())
 
 
+@pytest.mark.slow
 def test_photographs_that_are_shrunk_give_the_same_scan_at_another_size(ramp_scan, whole, tmp_path, monkeypatch):
     """Captures three times as large, with what belongs to their pixels: a mask, colours, and two picked places.
 

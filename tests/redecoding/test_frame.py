@@ -128,6 +128,7 @@ def test_wrong_cells_are_replaced(predicted):
     ],
     ids=["blank", "another pattern", "noise", "one period", "across", "two periods"],
 )
+@pytest.mark.slow
 def test_an_image_or_a_prediction_that_is_wrong_everywhere_changes_nothing(predicted, image, away):
     off = replace(predicted, coords=predicted.coords + np.float32(away))
     for decoded in (with_holes(truth(), 0.6), np.full_like(truth(), np.nan)):
@@ -147,6 +148,7 @@ def test_where_the_image_lacks_the_pattern_nothing_is_added(predicted):
 
 
 @pytest.mark.parametrize("away", [(12, 5), (20, 0), (-20, 20), (60, 40)])
+@pytest.mark.slow
 def test_a_prediction_that_is_wrong_in_a_part_gives_nothing_wrong_there(predicted, away):
     coords = predicted.coords.copy()
     coords[:, 84:] += np.float32(away)

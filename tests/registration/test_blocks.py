@@ -145,6 +145,7 @@ def test_a_frame_that_one_pair_holds_at_a_wrong_place_is_put_where_the_others_se
     assert off_deg(found.decided) < 0.1
 
 
+@pytest.mark.slow
 def test_the_order_of_capture_keeps_what_surfaces_leave_open_and_that_is_said():
     def prior(i: int, j: int, S: Similarity) -> float:
         return -25.0 * float(abs(i - j) == 1 and abs(angle_deg(S.R) - 30) > 10)

@@ -129,7 +129,7 @@ def plain(mover: FrameEvidence, seen: FrameEvidence, S: Similarity, own: ndarray
 
 
 @pytest.mark.parametrize("name", sorted(CAMERAS))
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_residuals_are_those_of_the_plain_formula_both_ways(name, seed):
     rng = np.random.default_rng(seed)
     source, target = any_frame(CAMERAS[name], seed), any_frame(CAMERAS["lens"], seed + 10)
@@ -266,7 +266,9 @@ def ground():
     return pair_of(waves, view(0.0, 1.0, 70.0), view(20.0, 1.3, 60.0))
 
 
-@pytest.mark.parametrize("height", [0.1, 0.3])  # the edge is up to 60 places from what it hides
+@pytest.mark.parametrize(
+    "height", [pytest.param(0.1, marks=pytest.mark.slow), 0.3]
+)  # the edge is up to 60 places from what it hides
 def test_what_an_edge_hides_contradicts_nothing_and_what_lies_behind_a_surface_does(height):
     """Of a ground that is higher on one side of a line, seen from its two sides: at its foot by one camera only."""
     views = view(0.0, 1.0, 45.0), view(180.0, 1.0, 45.0)
@@ -402,6 +404,7 @@ TURNS = (0.0, 9.0, -15.0, 40.0)
 
 
 @pytest.mark.parametrize(("bump", "least", "most"), [(0.0, -3.0, 3.0), (0.08, LEAST_ODDS, np.inf)])
+@pytest.mark.slow
 def test_a_surface_of_revolution_says_nothing_about_a_turn_and_a_bump_on_it_does(bump, least, most):
     views = view(0.0), view(20.0, 1.4)
     (source, target), _ = pair_of(lambda p: pot(p, bump), *views)

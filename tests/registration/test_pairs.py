@@ -291,6 +291,7 @@ def test_slipping_about_the_axis_of_a_vase_is_found_and_its_size_is_stated():
 
 
 @pytest.mark.parametrize("scene", ["head", "frog"])
+@pytest.mark.slow
 def test_objects_with_a_relief_do_not_slip(scene):
     found, true, target, _ = matched(scene, 4, 5)
     angle, shift, _ = difference(found.S_target_source, true, target.centroid)
@@ -353,6 +354,7 @@ def test_the_blotches_of_a_vase_hold_it(pair):
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.slow
 def test_tones_that_are_not_the_surface_s_hold_nothing(seed):
     """Those of another vase; and the same at the same places of both images: a highlight, not a print."""
     (first, second), _ = vase(4, 6)

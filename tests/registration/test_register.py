@@ -112,6 +112,7 @@ def test_a_shuffled_sequence_is_recognised_and_registered_all_the_same():
     [("leaf", (0, 2, 4, 6, 8, 10)), ("head", (4, 5, 6, 16, 17))],
     ids=["leaf", "two sides of a head"],
 )
+@pytest.mark.slow
 def test_frames_that_share_little_are_right_or_named(scene, frames):
     """A sheet that some frames see nearly from its edge, and two sides of an object without what is between."""
     some = rendered(scene, frames)
@@ -148,6 +149,7 @@ def test_rough_camera_poses_are_a_start(clouds, past):
 # Frames that are left out, or uncertain.
 
 
+@pytest.mark.slow
 def test_frames_of_a_separate_group_name_it_and_where_to_capture(few):
     """The last two show another object, a head, and match each other alone."""
     true = rendered("head", (4, 5))
@@ -198,6 +200,7 @@ def test_where_nothing_is_joined_because_everything_slips_every_frame_says_so():
     assert excluded | {u.frame for u in found.uncertainties if u.sigma_deg > 60} == set(found.names)
 
 
+@pytest.mark.slow
 def test_the_rotation_of_a_ball_is_uncertain(clouds):
     """Every frame is named, whether its neighbours agree with it by chance or not."""
     found = register([on_a_ball(clouds[k], 0.8, f"ball {k}") for k in range(3)])
@@ -291,6 +294,7 @@ def test_the_true_pose_is_chosen_by_what_the_neighbours_saw(true_first):
         assert clouds[k].points is CLOUDS[k].points
 
 
+@pytest.mark.slow
 def test_where_only_a_flat_disk_is_seen_a_frame_is_right_or_named():
     """Its rim may still tell; the face of the disk does not."""
     flat = [two_poses(k, coords_of_disk(k), False) for k in range(4)]

@@ -57,6 +57,7 @@ def with_odd_frame(scan, motion):
 
 
 @pytest.mark.parametrize("share", [0.2, 0.8])
+@pytest.mark.slow
 def test_what_one_frame_did_not_decode_is_measured(frog, share):
     assert min(shared_surface_of_scan(frog).decoded) > 0.97
     coords, masks = read(frog)

@@ -28,6 +28,7 @@ def examined(request):
     return check_folder(folder(request.param))
 
 
+@pytest.mark.slow
 def test_real_captures_are_clean(examined):
     assert examined.faults == ()
     assert examined.fit is not None and examined.scan is not None
@@ -45,6 +46,7 @@ def test_real_captures_with_rough_poses_are_clean(examined):
 
 
 @pytest.mark.parametrize("how", ["inverted", "OpenCV axes", "inverted, OpenCV axes"])
+@pytest.mark.slow
 def test_mixed_up_real_captures_are_named(examined, how):
     assert examined.scan is not None
     frames = [content.correspondences for content in examined.contents if content.correspondences is not None]

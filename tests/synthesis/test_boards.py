@@ -16,6 +16,7 @@ from sl_nerfstudio.synthesis.config import SynthConfig
 
 
 @pytest.mark.parametrize("scene", BOARDS)
+@pytest.mark.slow
 def test_corners_are_where_the_truth_projects_them(scene, tmp_path):
     (tmp_path / "p.json").write_bytes(GrayCode(64, 48, 16).encode())
     config = SynthConfig(

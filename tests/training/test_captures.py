@@ -45,6 +45,7 @@ def test_damaged_graphs_are_parts_of_the_turned_pattern(turn):
     assert neighbourhoods(graph.neighbour).max() < len(graph.place)
 
 
+@pytest.mark.slow
 def test_rendered_captures_can_be_read_and_their_truth_fits_what_is_read():
     found = list(rendered_captures(0, 2, 2))
     assert len(found) == 2 and all(one.image.shape == one.true.shape[:2] for one in found)

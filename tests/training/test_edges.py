@@ -34,6 +34,7 @@ def test_the_best_possible_output_costs_least():
     assert losses(EdgeOutput(scores, -100 * (2.0 * wrong - 1)), errors)["wrong"] > 50
 
 
+@pytest.mark.slow
 def test_an_interrupted_training_ends_where_an_uninterrupted_one_does(small, monkeypatch):
     monkeypatch.setattr(edges, "_CHECKPOINT", 2)
     train(small)

@@ -22,6 +22,7 @@ MOVING = [kind for kind in KINDS if "off" not in kind.get("modes", ())]
 
 @pytest.mark.parametrize("size", [1e-6, 0.05, 1.0])  # series below 0.3 rad
 @pytest.mark.parametrize("kind", [*MOVING, {"about_scene": False, "shared_projector": True}])
+@pytest.mark.slow
 def test_poses_and_adjoints_of_all_parametrisations_are_torchs(kind: dict[str, Any], size: float) -> None:
     torch.manual_seed(0)
     bases = exp_se3(torch.randn(2, FRAMES, 6, dtype=torch.float64))
