@@ -97,8 +97,9 @@ def odds(problem: SearchProblem, one: Rig, two: Rig, noise: float) -> Odds:
     (mine, good), (theirs, as_good) = (anchors_at(rig, frame, uv, seen) for rig in (one, two))
     ends = [_End(one, mine, good & as_good), _End(two, theirs, good & as_good)]
     allowed = torch.stack([end.partners(problem.maps, generator) for end in ends]).any(0)
-    numbers = [end.numbers(problem.maps, allowed, generator) for end in ends]
-    rows = _common(one.frames, *numbers, EVERY_FRAME_PER_ANCHOR * int(ends[0].good.sum()), generator)
+    first, second = (end.numbers(problem.maps, allowed, generator) for end in ends)
+    most = EVERY_FRAME_PER_ANCHOR * int(ends[0].good.sum())
+    rows = _common(one.frames, first, second, most, generator)
     gain, block, common = _gains(problem.maps, ends, rows, noise, uv)
     share = min(INDEPENDENT * one.frames / max(common, 1), 1.0)
     mean, error = mean_and_error(share * gain, block)
