@@ -8,7 +8,7 @@ anchor is the same pixel of the same frame, at the depth that each rig gives it,
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from math import exp, pi
 
@@ -95,11 +95,11 @@ def odds(problem: SearchProblem, one: Rig, two: Rig, noise: float) -> Odds:
     frame, uv = problem.maps.draw(torch.arange(one.frames), _COMPARED_ANCHORS, generator)
     seen = problem.maps.look_up(frame, uv)
     (mine, good), (theirs, as_good) = (anchors_at(rig, frame, uv, seen) for rig in (one, two))
-    ends = [_End(one, mine, good & as_good), _End(two, theirs, good & as_good)]
+    both = good & as_good
+    ends = [_End(one, mine, both), _End(two, theirs, both)]
     allowed = torch.stack([end.partners(problem.maps, generator) for end in ends]).any(0)
     first, second = (end.numbers(problem.maps, allowed, generator) for end in ends)
-    most = EVERY_FRAME_PER_ANCHOR * int(ends[0].good.sum())
-    rows = _common(one.frames, first, second, most, generator)
+    rows = _common(one.frames, first, second, EVERY_FRAME_PER_ANCHOR * int(both.sum()), generator)
     gain, block, common = _gains(problem.maps, ends, rows, noise, uv)
     share = min(INDEPENDENT * one.frames / max(common, 1), 1.0)
     mean, error = mean_and_error(share * gain, block)
@@ -226,9 +226,9 @@ def with_slides(
 
     for motion, k in zip(motions, frames, strict=True):
         motion[:, k] = directions[k].reshape(2, 6)
-    sizes = results([partial(slid, motion, k) for motion, k in zip(motions, frames, strict=True)])
-    columns = torch.tensor(sizes, dtype=torch.float64)[:, None] * motions.flatten(1)
-    columns = columns.mT[:, torch.tensor(sizes) > 0]
+    asked = [partial(slid, motion, k) for motion, k in zip(motions, frames, strict=True)]
+    sizes = torch.tensor(results(asked), dtype=torch.float64)
+    columns = (sizes[:, None] * motions.flatten(1)).mT[:, sizes > 0]
     return torch.cat([factor, torch.nn.functional.pad(columns, (0, 0, 0, len(factor) - 12 * n))], 1)
 
 
@@ -249,7 +249,6 @@ class PlaceOfFrame:
     noise: float  # of one look-up, projector pixels
     here: _End
     uv: Float[Tensor, "anchors 2"]  # the anchors' pixels
-    mine: Int[Tensor, "m"]  # anchors of the frame
     seen: MapSample  # what was decoded at those
     allowed: Bool[Tensor, "frames frames"]  # which frames look up whose anchors
     numbers: Int[Tensor, "rows"]  # of the look-ups here
@@ -264,33 +263,23 @@ class PlaceOfFrame:
         chosen = owner == frame
         chosen[:: max(_OF_OTHERS, rig.frames)] = True
         owner, uv = owner[chosen], uv[chosen]
-        mine, maps = (owner == frame).nonzero()[:, 0], problem.maps
-        here = _End(rig, *anchors_at(rig, owner, uv, maps.look_up(owner, uv)))
+        seen = problem.maps.look_up(owner, uv)
+        here = _End(rig, *anchors_at(rig, owner, uv, seen))
         generator = torch.Generator().manual_seed(problem.settings.seed)
         its = torch.arange(rig.frames) == frame
-        allowed = here.partners(maps, generator) & (its | its[:, None])
-        numbers = here.numbers(maps, allowed, generator)
-        seen = maps.look_up(owner[mine], uv[mine])
-        return PlaceOfFrame(problem, noise, here, uv, mine, seen, allowed, numbers)
+        allowed = here.partners(problem.maps, generator) & (its | its[:, None])
+        numbers = here.numbers(problem.maps, allowed, generator)
+        return PlaceOfFrame(problem, noise, here, uv, seen, allowed, numbers)
 
     def lead_of(self, other: Rig) -> float:
         """By how many of its standard errors a rig in which that frame alone is elsewhere is more probable."""
         maps, generator = self.problem.maps, torch.Generator().manual_seed(self.problem.settings.seed)
-        frame = self.here.anchors.frame[self.mine]
-        there = _End(other, *self._moved(*anchors_at(other, frame, self.uv[self.mine], self.seen)))
+        there = _End(other, *anchors_at(other, self.here.anchors.frame, self.uv, self.seen))
         numbers = there.numbers(maps, self.allowed, generator)
         rows = _common(other.frames, self.numbers, numbers, _FRAME_LOOK_UPS, generator)
         gain, block, _ = _gains(maps, [there, self.here], rows, self.noise, self.uv)
         mean, error = mean_and_error(gain, block)
         return mean / error if error > 0 else 0.0
-
-    def _moved(self, mine: Anchors, good: Bool[Tensor, "m"]) -> tuple[Anchors, Bool[Tensor, "anchors"]]:
-        """All anchors, with those of the frame where they are at another place of it."""
-        anchors = replace(self.here.anchors, **{
-            name: getattr(self.here.anchors, name).index_copy(0, self.mine, getattr(mine, name))
-            for name in ("d_camera", "depth", "normal")
-        })  # fmt: skip
-        return anchors, self.here.good.index_copy(0, self.mine, good)
 
 
 def least_known_motions(

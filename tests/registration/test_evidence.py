@@ -266,9 +266,8 @@ def ground():
     return pair_of(waves, view(0.0, 1.0, 70.0), view(20.0, 1.3, 60.0))
 
 
-@pytest.mark.parametrize(
-    "height", [pytest.param(0.1, marks=pytest.mark.slow), 0.3]
-)  # the edge is up to 60 places from what it hides
+# The edge is up to 60 places from what it hides.
+@pytest.mark.parametrize("height", [pytest.param(0.1, marks=pytest.mark.slow), 0.3])
 def test_what_an_edge_hides_contradicts_nothing_and_what_lies_behind_a_surface_does(height):
     """Of a ground that is higher on one side of a line, seen from its two sides: at its foot by one camera only."""
     views = view(0.0, 1.0, 45.0), view(180.0, 1.0, 45.0)
