@@ -141,6 +141,7 @@ except Exception as error:
 """
 
 
+@pytest.mark.slow
 def test_a_wrong_shape_is_refused_only_where_types_are_checked():
     def error_of(**environment: str) -> str:
         done = subprocess.run(

@@ -118,6 +118,7 @@ class LMState:
     anchors: Anchors
     damping: float
     size: float = 0.0  # largest component of the last step, scene units or radian; 0 if no step lowered the objective
+    gain: float = 0.0  # by which the last step lowered the objective, px^2
 
 
 def lm_step(
@@ -150,9 +151,10 @@ def lm_step(
         moved, placed = moved_together(rig, anchors, equations, step)
         after = residuals_of(moved, placed, rows, maps)
         both = r.cross_valid & after.cross_valid
-        if kernel.cost(after, both) + prior.energy(moved) < kernel.cost(r, both) + energy:
+        gain = kernel.cost(r, both) + energy - kernel.cost(after, both) - prior.energy(moved)
+        if gain > 0:
             damping = max(damping / _RELAX, _LEAST_DAMPING)
-            return LMState(moved, placed, damping, float(step.abs().max()))
+            return LMState(moved, placed, damping, float(step.abs().max()), gain)
         damping = damping * _TIGHTEN
     return LMState(rig, anchors, damping)
 

@@ -37,6 +37,7 @@ from sl_nerfstudio.bundle_adjustment.posterior import GROSS, Odds, odds, with_sl
 from sl_nerfstudio.bundle_adjustment.residuals import Rig, linearise
 from sl_nerfstudio.bundle_adjustment.search import (
     FRAMES_MOVE,
+    LEAST_GAIN,
     SearchProblem,
     SearchProgress,
     SearchStage,
@@ -62,7 +63,7 @@ _HALF = 0.5  # share of the frames that every second one moves
 _MOST_LEFT = 0.35  # share of a distance within which all frames must return for a search to lead back
 _DRAWN = 3  # searches from poses as uncertain as the starting ones, if a result is one of several minima
 _SHAKE_SIGMAS = 2.0  # distance from the result, in its sigma, from which further steps should lead back
-_SHAKE_STEPS = 6  # most of those steps
+_SHAKE_STEPS = 12  # most of those steps
 _MOST_FRAMES = 100  # beyond which no further search is made: it takes time, and many frames hold each other
 _LEAST_WEIGHT = 1e-4  # of an end, relative to the result, that is worth saying
 _BARRIER = 20.0  # nats that the posterior falls between two modes: errors of look-ups make small ones everywhere
@@ -252,7 +253,8 @@ def _shaken_leads_back(
     equations = normal_equations(linear, best.rows, *kernel.weights(linear.residuals))
     rig, anchors = moved_together(state.rig, state.anchors, equations, torch.cat([delta, rho], 1))
     beside = replace(state, rig=rig, anchors=anchors)
-    back = run_stage(problem, SearchStage(found.refine, False, _SHAKE_STEPS), replace(best, state=beside))
+    stage = SearchStage(found.refine, False, _SHAKE_STEPS, least_gain=LEAST_GAIN)
+    back = run_stage(problem, stage, replace(best, state=beside))
     end = with_frames_of(back.state.rig, found.rig, unplaced)
     return farthest_frame(factor, departure_of(end, found.rig)) <= _MOST_LEFT * _SHAKE_SIGMAS
 

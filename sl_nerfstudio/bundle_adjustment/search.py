@@ -56,6 +56,7 @@ INDEPENDENT = 50.0  # residuals of a frame that count as independent of each oth
 _KERNEL_MEDIANS = 2.0  # width that a frame's kernel narrows to, in its median residuals
 _KERNEL_NOISES = 3.0  # smallest width, in estimated noises
 _CONVERGED = 1e-4  # largest component of a step, scene units or radian, below which the poses have converged
+LEAST_GAIN = 1.0  # of the last steps, squared noises: slopes are noisy, so each step is a part of the way alone
 _SETTLED = 0.98  # share of its last width above which a kernel counts as no longer narrowing
 
 # Frames that agree with the others.
@@ -150,6 +151,7 @@ class SearchStage:
     rough: bool  # residuals still come from wrong poses: those of one frame are correlated and count as few
     iterations: int  # at most
     own_place_px: float = 0.0  # see `linearise`
+    least_gain: float = float("inf")  # of a step, squared noises, from which even small ones go on
 
 
 def stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[SearchStage]:
@@ -196,6 +198,7 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
         state = lm_step(found.state, linear, found.rows, maps, kernel, prior, free)
         # a step may also be small because it was damped
         small = state.size < _CONVERGED and (state.damping < 1 or state.size == 0)
+        small = small and state.gain < stage.least_gain * found.alike * noise**2
         settled = bool((widths >= _SETTLED * found.widths).all()) and small
         found = replace(found, state=state, widths=widths, noise=noise, iterations=found.iterations + 1)
         if settled:
@@ -258,9 +261,8 @@ def with_more_anchors(problem: SearchProblem, refine: RefinePoses, found: Search
     many = replace(s, anchors_per_frame=_MORE_ANCHORS * s.anchors_per_frame, max_anchors=_MORE_ANCHORS * s.max_anchors)
     here, found = _observed_anew(problem, many, found)
     found = _away_from_borders(here, replace(found, alike=_MORE_ANCHORS))
-    for steps, own_place_px in ((s.max_iterations // 8, OWN_PLACE_PX), (s.max_iterations // 4, 0.0)):
-        found = run_stage(here, SearchStage(refine, False, steps, own_place_px), found)
-    return found
+    found = run_stage(here, SearchStage(refine, False, s.max_iterations // 8, OWN_PLACE_PX), found)
+    return run_stage(here, SearchStage(refine, False, s.max_iterations // 2, least_gain=LEAST_GAIN), found)
 
 
 def _observed_anew(

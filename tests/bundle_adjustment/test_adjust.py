@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment import adjust as adjustment
-from sl_nerfstudio.bundle_adjustment import modes, observations
+from sl_nerfstudio.bundle_adjustment import modes, observations, search
 from sl_nerfstudio.bundle_adjustment.adjust import (
     Adjustment,
     CrossValidation,
@@ -23,11 +23,11 @@ from sl_nerfstudio.bundle_adjustment.adjust import (
     with_other_minima,
 )
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
-from sl_nerfstudio.bundle_adjustment.modes import departure_of
+from sl_nerfstudio.bundle_adjustment.modes import departure_of, farthest_frame
 from sl_nerfstudio.bundle_adjustment.parameters import PosePrior, constrained
 from sl_nerfstudio.bundle_adjustment.posterior import mean_and_error
 from sl_nerfstudio.bundle_adjustment.residuals import Rig
-from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings
+from sl_nerfstudio.bundle_adjustment.search import AdjustmentSettings, SearchStage, run_stage
 from tests.formulas import pose_errors
 
 from . import analytic
@@ -185,11 +185,22 @@ SEVERAL = AdjustmentSettings(anchors_per_frame=150, frames_per_anchor=3, max_ite
 ONE = replace(SEVERAL, other_minima=False)
 
 
-def noisy_maps(seed: int, noise: float, size: int = SIZE) -> CoordinateMaps:
+def noisy_maps(seed: int, noise: float, size: int = SIZE, frames: int = FEW) -> CoordinateMaps:
     """Noisy coordinate images of the scene as it is now."""
     generator = torch.Generator().manual_seed(seed)
-    images = images_of(rig_of(FEW, size), size)
+    images = images_of(rig_of(frames, size), size)
     return CoordinateMaps.of([image + noise * torch.randn(size, size, 2, generator=generator) for image in images])
+
+
+@pytest.mark.slow
+def test_further_steps_move_no_frame_by_much_of_its_sigma(monkeypatch):
+    """Steps are small where noise is, and add up: those below 1e-4 alone led on by 1.3 sigma."""
+    size = 200
+    start, maps = disturbed(rig_of(FRAMES, size), 1), noisy_maps(1, 0.03, size, FRAMES)
+    found = find_minimum(start, maps, prior_of(FRAMES, 0.05, 0.03, 0.005, 0.005), "free", AdjustmentSettings())
+    monkeypatch.setattr(search, "_CONVERGED", 1e-9)
+    onwards = run_stage(found.explored.problem, SearchStage("free", False, 30), found.explored.best)
+    assert farthest_frame(found.factor, departure_of(onwards.state.rig, found.rig)) < 0.3
 
 
 def test_frames_that_slide_on_a_plane_have_a_sigma_that_covers_their_error(monkeypatch):

@@ -103,7 +103,7 @@ def objective(state: LMState, rows, maps, kernel: Kernel, prior: PriorTerm, vali
     return kernel.cost(residuals_of(state.rig, state.anchors, rows, maps), valid) + prior.energy(state.rig)
 
 
-@pytest.mark.parametrize("weight", [0.0, 1e-2, 1e4])
+@pytest.mark.parametrize("weight", [0.0, 1e4])
 @pytest.mark.parametrize("mode", MODES)
 def test_a_step_lowers_data_and_prior_together(scene, mode, weight):
     _, maps, rig, anchors, rows = scene

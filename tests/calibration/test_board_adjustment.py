@@ -39,7 +39,7 @@ def solved(scene, free, model="OPENCV", points=POINTS):
 @pytest.mark.parametrize(
     ("camera", "projector", "free"),
     [
-        (CAMERA, PROJECTOR, (TWO, ONE)),
+        pytest.param(CAMERA, PROJECTOR, (TWO, ONE), marks=pytest.mark.slow),
         pytest.param(TANGENTIAL, PLAIN_PROJECTOR, (ALL, PLAIN), marks=pytest.mark.slow),
         (CAMERA, None, (TWO,)),
         (TANGENTIAL, replace(DOE, k1=0.1), (ALL, ALL)),
@@ -56,7 +56,14 @@ def test_exact_corners_give_the_exact_devices_and_poses(camera, projector, free)
     np.testing.assert_allclose(found.rig.T_projector_camera, scene.truth.T_projector_camera, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize(("device", "aspect"), [("camera", 0.7), ("projector", 0.5), ("projector", 2.0)])
+@pytest.mark.parametrize(
+    ("device", "aspect"),
+    [
+        pytest.param("camera", 0.7, marks=pytest.mark.slow),
+        pytest.param("projector", 0.5, marks=pytest.mark.slow),
+        ("projector", 2.0),
+    ],
+)
 def test_pixels_need_not_be_square(device, aspect):
     """A projector of 912 x 1140 diamond pixels has fl_y = 2 fl_x; the field of view stays that of square ones."""
 

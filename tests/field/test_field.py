@@ -37,8 +37,8 @@ def reference(p: Tensor, g: Tensor, v: Tensor | None, hidden: int) -> tuple[list
 @pytest.mark.parametrize("of_gradients", [False, True])
 def test_values_and_derivatives_are_those_of_double_backward(backend, dtype, tolerance, hidden, of_gradients):
     """Of values by points and parameters, and of values and gradients by the parameters."""
-    p, g = points_around(300), torch.randn(300).double()
-    v = torch.randn(300, 3).double() if of_gradients else None
+    p, g = points_around(150), torch.randn(150).double()
+    v = torch.randn(150, 3).double() if of_gradients else None
     (f_true, n_true), parameters_true = reference(p, g, v, hidden)
     field = make_field(backend, dtype, hidden=hidden)
     field.encoding.set_level_weights(WEIGHTS.to(dtype))

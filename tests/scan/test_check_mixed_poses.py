@@ -80,8 +80,8 @@ def test_poses_within_what_is_stated_are_left_alone(seed):
     ("kinds", "words", "key"),
     [
         (["camera"], "the camera poses", "transform_matrix"),
-        (["projector"], "the projector poses", "projector_transform_matrix"),
-        (["camera", "projector"], "the poses of both devices", "transform_matrix"),
+        pytest.param(["projector"], "the projector poses", "projector_transform_matrix", marks=pytest.mark.slow),
+        pytest.param(["camera", "projector"], "the poses of both devices", "transform_matrix", marks=pytest.mark.slow),
     ],
 )
 def test_an_order_that_is_not_that_of_the_images_is_named(kinds, words, key):
@@ -97,7 +97,7 @@ def test_an_order_that_is_not_that_of_the_images_is_named(kinds, words, key):
         assert "the stated uncertainty explains" in problem.problem and f"put {words} in the order" in problem.remedy
 
 
-@pytest.mark.parametrize("kind", ["camera", "projector"])
+@pytest.mark.parametrize("kind", ["camera", pytest.param("projector", marks=pytest.mark.slow)])
 def test_a_world_of_one_kind_of_device_is_named(kind):
     R = EXACT[kind]
     _, problem = only(in_world(scan(), kind, Similarity(1.0, np.array(R, float), np.zeros(3))))

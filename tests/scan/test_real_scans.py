@@ -23,7 +23,7 @@ def folder(name):
     return DATA / name
 
 
-@pytest.fixture(scope="module", params=["elephant", "house"])
+@pytest.fixture(scope="module", params=[pytest.param("elephant", marks=pytest.mark.slow), "house"])
 def examined(request):
     return check_folder(folder(request.param))
 
