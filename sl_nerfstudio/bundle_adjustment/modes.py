@@ -63,7 +63,8 @@ _HALF = 0.5  # share of the frames that every second one moves
 _MOST_LEFT = 0.35  # share of a distance within which all frames must return for a search to lead back
 _DRAWN = 3  # searches from poses as uncertain as the starting ones, if a result is one of several minima
 _SHAKE_SIGMAS = 2.0  # distance from the result, in its sigma, from which further steps should lead back
-_SHAKE_STEPS = 12  # most of those steps
+_SHAKE_STEPS = 15  # most of those steps
+_SHAKE_LEFT = 0.25  # share of that distance within which all frames must return: what slides ends 0.25 to 0.7 away
 _MOST_FRAMES = 100  # beyond which no further search is made: it takes time, and many frames hold each other
 _LEAST_WEIGHT = 1e-4  # of an end, relative to the result, that is worth saying
 _BARRIER = 20.0  # nats that the posterior falls between two modes: errors of look-ups make small ones everywhere
@@ -256,7 +257,7 @@ def _shaken_leads_back(
     stage = SearchStage(found.refine, False, _SHAKE_STEPS, least_gain=LEAST_GAIN)
     back = run_stage(problem, stage, replace(best, state=beside))
     end = with_frames_of(back.state.rig, found.rig, unplaced)
-    return farthest_frame(factor, departure_of(end, found.rig)) <= _MOST_LEFT * _SHAKE_SIGMAS
+    return farthest_frame(factor, departure_of(end, found.rig)) <= _SHAKE_LEFT * _SHAKE_SIGMAS
 
 
 def shake(factor: Float[Tensor, "joint k"], sigmas: float, generator: torch.Generator) -> Float[Tensor, "unknowns"]:

@@ -237,7 +237,8 @@ def search(problem: SearchProblem, refine: RefinePoses) -> tuple[SearchProgress,
     for stage in rough:
         found = run_stage(problem, stage, found)
     found = _away_from_borders(problem, found)
-    found = run_stage(problem, replace(last, iterations=max(settings.max_iterations - found.iterations, 1)), found)
+    left = max(settings.max_iterations - found.iterations, 1)
+    found = run_stage(problem, replace(last, iterations=left, least_gain=LEAST_GAIN), found)
     return found, before
 
 
