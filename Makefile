@@ -71,6 +71,14 @@ $(STAMP): $(BIN)/python pyproject.toml constraints.txt
 	  echo "       If a shared library is missing (libGL.so.1, libgomp.so.1): 'apt-get install libgl1 libgomp1'." >&2; \
 	  exit 1; \
 	}
+	@echo "compiling, by a small scan (once; minutes)"
+	@folder="$$(mktemp -d)"; export SL_CACHE="$$folder/cache"; \
+	{ $(BIN)/sl-synth --output "$$folder/captures" --images-only --frames 5 --resolution 300 && \
+	  $(BIN)/sl-scan "$$folder/captures/images" --pattern "$$folder/captures/pattern.json" \
+	    --intrinsics "$$folder/captures/intrinsics.json" --output "$$folder/result" --quality draft; \
+	} >$(VENV)/small-scan.log 2>&1 </dev/null || \
+	  echo "not everything is compiled (why: $(VENV)/small-scan.log): the first commands take a minute longer"; \
+	rm -rf "$$folder"
 	@touch $@
 
 # Every step of the demos is a target: `make demo` goes on after what is complete. Each command writes its file that is

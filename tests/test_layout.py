@@ -3,9 +3,8 @@
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sl_nerfstudio"
@@ -44,36 +43,36 @@ def layer(path: Path) -> str:
     return path.relative_to(PACKAGE).with_suffix("").parts[0]
 
 
-@pytest.fixture(scope="module")
+@cache
 def imported() -> dict[Path, set[str]]:
     """The names that each file of the package imports."""
     return {path: set(imports(path.read_text(), path)) for path in MODULES}
 
 
-@pytest.fixture(scope="module")
-def neighbours(imported: dict[Path, set[str]]) -> dict[Path, set[Path]]:
+@cache
+def neighbours() -> dict[Path, set[Path]]:
     """The files of the package that each of them imports."""
     return {
         path: {file for name in names if name.startswith("sl_nerfstudio") and (file := file_of(name))} - {path}
-        for path, names in imported.items()
+        for path, names in imported().items()
     }
 
 
-def test_folders_import_only_from_those_before_them(imported, neighbours):
+def test_folders_import_only_from_those_before_them():
     assert sorted({layer(path) for path in MODULES} - {"__init__"}) == sorted(LAYERS)
     wrong = [
         f"{path.relative_to(PACKAGE)} imports {file.relative_to(PACKAGE)}"
-        for path, files in neighbours.items()
+        for path, files in neighbours().items()
         for file in files - {PACKAGE / "__init__.py"}
         if layer(path) != "__init__" and LAYERS.index(layer(file)) > LAYERS.index(layer(path))
     ]
     assert not wrong, wrong
     assert {
-        layer(path) for path, names in imported.items() if "nerfstudio" in {n.split(".")[0] for n in names}
+        layer(path) for path, names in imported().items() if "nerfstudio" in {n.split(".")[0] for n in names}
     } == PLUGIN
 
 
-def test_no_files_import_each_other_in_a_cycle(neighbours):
+def test_no_files_import_each_other_in_a_cycle():
     """Depth first; a file that is reached again while its imports are still being followed closes a cycle."""
     done: set[Path] = set()
 
@@ -81,7 +80,7 @@ def test_no_files_import_each_other_in_a_cycle(neighbours):
         circle = [str(p.relative_to(PACKAGE)) for p in way[way.index(path) :]] if path in way else []
         assert not circle, " -> ".join([*circle, circle[0]])
         if path not in done:
-            for other in sorted(neighbours[path]):
+            for other in sorted(neighbours()[path]):
                 follow(other, (*way, path))
             done.add(path)
 

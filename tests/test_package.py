@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_layout import IMPORTS
+from tests.test_layout import imported
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -70,11 +70,11 @@ def test_exactly_one_opencv():
 
 def test_imported_packages_are_the_declared_dependencies():
     standard = sys.stdlib_module_names | {"sl_nerfstudio", "triton"}  # which comes with torch, if at all
-    imported = {name.split(".")[0] for names in IMPORTS.values() for name in names} - standard
+    used = {name.split(".")[0] for names in imported().values() for name in names} - standard
     extras = [text for name, texts in PROJECT["optional-dependencies"].items()
               if name not in ("dev", "docs", "render") for text in texts]  # fmt: skip
     declared = {distribution_name(text) for text in PROJECT["dependencies"] + extras}
-    assert imported == {IMPORTED_AS.get(name, name) for name in declared}
+    assert used == {IMPORTED_AS.get(name, name) for name in declared}
 
 
 def test_no_url_and_no_machine_path_in_the_code():
