@@ -37,7 +37,6 @@ from sl_nerfstudio.bundle_adjustment.posterior import GROSS, Odds, odds, with_sl
 from sl_nerfstudio.bundle_adjustment.residuals import Rig, linearise
 from sl_nerfstudio.bundle_adjustment.search import (
     FRAMES_MOVE,
-    LEAST_GAIN,
     SearchProblem,
     SearchProgress,
     SearchStage,
@@ -254,8 +253,7 @@ def _shaken_leads_back(
     equations = normal_equations(linear, best.rows, *kernel.weights(linear.residuals))
     rig, anchors = moved_together(state.rig, state.anchors, equations, torch.cat([delta, rho], 1))
     beside = replace(state, rig=rig, anchors=anchors)
-    stage = SearchStage(found.refine, False, _SHAKE_STEPS, least_gain=LEAST_GAIN)
-    back = run_stage(problem, stage, replace(best, state=beside))
+    back = run_stage(problem, SearchStage(found.refine, False, _SHAKE_STEPS), replace(best, state=beside))
     end = with_frames_of(back.state.rig, found.rig, unplaced)
     return farthest_frame(factor, departure_of(end, found.rig)) <= _SHAKE_LEFT * _SHAKE_SIGMAS
 

@@ -56,7 +56,7 @@ INDEPENDENT = 50.0  # residuals of a frame that count as independent of each oth
 _KERNEL_MEDIANS = 2.0  # width that a frame's kernel narrows to, in its median residuals
 _KERNEL_NOISES = 3.0  # smallest width, in estimated noises
 _CONVERGED = 1e-4  # largest component of a step, scene units or radian, below which the poses have converged
-LEAST_GAIN = 1.0  # of the last steps, squared noises: slopes are noisy, so each step is a part of the way alone
+_LEAST_GAIN = 1.0  # of a last step, squared noises, from which even small ones go on: each is a part of the way alone
 _SETTLED = 0.98  # share of its last width above which a kernel counts as no longer narrowing
 
 # Frames that agree with the others.
@@ -151,7 +151,6 @@ class SearchStage:
     rough: bool  # residuals still come from wrong poses: those of one frame are correlated and count as few
     iterations: int  # at most
     own_place_px: float = 0.0  # see `linearise`
-    least_gain: float = float("inf")  # of a step, squared noises, from which even small ones go on
 
 
 def stages(refine: RefinePoses, settings: AdjustmentSettings) -> list[SearchStage]:
@@ -198,7 +197,8 @@ def run_stage(problem: SearchProblem, stage: SearchStage, found: SearchProgress)
         state = lm_step(found.state, linear, found.rows, maps, kernel, prior, free)
         # a step may also be small because it was damped
         small = state.size < _CONVERGED and (state.damping < 1 or state.size == 0)
-        small = small and state.gain < stage.least_gain * found.alike * noise**2
+        if not (stage.rough or stage.own_place_px):  # by noisy slopes, whose noise counts as curvature
+            small = small and state.gain < _LEAST_GAIN * weight
         settled = bool((widths >= _SETTLED * found.widths).all()) and small
         found = replace(found, state=state, widths=widths, noise=noise, iterations=found.iterations + 1)
         if settled:
@@ -237,8 +237,7 @@ def search(problem: SearchProblem, refine: RefinePoses) -> tuple[SearchProgress,
     for stage in rough:
         found = run_stage(problem, stage, found)
     found = _away_from_borders(problem, found)
-    left = max(settings.max_iterations - found.iterations, 1)
-    found = run_stage(problem, replace(last, iterations=left, least_gain=LEAST_GAIN), found)
+    found = run_stage(problem, replace(last, iterations=max(settings.max_iterations - found.iterations, 1)), found)
     return found, before
 
 
@@ -262,8 +261,9 @@ def with_more_anchors(problem: SearchProblem, refine: RefinePoses, found: Search
     many = replace(s, anchors_per_frame=_MORE_ANCHORS * s.anchors_per_frame, max_anchors=_MORE_ANCHORS * s.max_anchors)
     here, found = _observed_anew(problem, many, found)
     found = _away_from_borders(here, replace(found, alike=_MORE_ANCHORS))
-    found = run_stage(here, SearchStage(refine, False, s.max_iterations // 8, OWN_PLACE_PX), found)
-    return run_stage(here, SearchStage(refine, False, s.max_iterations // 2, least_gain=LEAST_GAIN), found)
+    for steps, own_place_px in ((s.max_iterations // 8, OWN_PLACE_PX), (s.max_iterations // 2, 0.0)):
+        found = run_stage(here, SearchStage(refine, False, steps, own_place_px), found)
+    return found
 
 
 def _observed_anew(
