@@ -54,10 +54,12 @@ def test_loading_a_run_does_not_import_the_compiler_until_somebody_asks(tmp_path
     assert printed(LOAD, tmp_path) == ["UserError True False", "False True"]
 
 
+@pytest.mark.slow
 def test_open3d_comes_without_its_web_viewer_until_somebody_asks(tmp_path):
     assert printed(OPEN3D.format(left_out=list(_LEFT_OUT)), tmp_path)[-3:] == ["[]", "True", "True"]
 
 
+@pytest.mark.slow
 def test_a_scan_is_judged_without_nerfstudio(tmp_path):
     assert printed(JUDGING, tmp_path) == ["False"]
 

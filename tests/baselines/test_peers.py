@@ -61,7 +61,7 @@ def test_a_camera_of_colmap_looks_along_its_own_z_axis() -> None:
     np.testing.assert_allclose(ours[:3, 0], T_world_camera[:3, 0], atol=1e-12)
 
 
-@pytest.mark.parametrize("appearance", ["plain", "realistic"])
+@pytest.mark.parametrize("appearance", [pytest.param("plain", marks=pytest.mark.slow), "realistic"])
 def test_without_the_pattern_the_light_is_constant_or_does_not_depend_on_the_projector(appearance) -> None:
     setup = make_setup(SynthConfig(scene="head", appearance=appearance, frames=3, resolution=40, images_only=True))
 

@@ -80,6 +80,7 @@ def test_pixels_need_not_be_square(device, aspect):
     assert max(start.sigma_px) < 0.1
 
 
+@pytest.mark.slow
 def test_the_unit_of_the_board_changes_lengths_alone():
     scene = make_scene(2, count=4, noise=0.1)
     mm, m = (solved(scene, (ONE, ONE), points=POINTS * unit) for unit in (1.0, 1e-3))

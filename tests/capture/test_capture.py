@@ -167,6 +167,7 @@ def test_the_grid_can_be_shown_by_the_same_command(film, keyboard, pattern):
     assert np.array_equal(middle(keyboard.shown[0], PATTERN.w, PATTERN.h)[..., 0], image)
 
 
+@pytest.mark.slow
 def test_each_kept_frame_is_photographed_in_white_light_too(command, keyboard, monkeypatch, pattern, tmp_path, capsys):
     """The camera sees the display: a picture for colours shows no line of the pattern."""
 

@@ -28,7 +28,9 @@ def gradients_of(field: Any, p: Tensor, q: Tensor) -> tuple[list[Tensor], list[A
     return [f.detach(), n.detach()], [p.grad, *(x.grad.clone() for x in field.parameters())]
 
 
-@pytest.mark.parametrize("counts", [(150, 100), (0, 50), (50, 0), (1, 1), (0, 0)])
+@pytest.mark.parametrize(
+    "counts", [(150, 100), (0, 0), *(pytest.param(n, marks=pytest.mark.slow) for n in ((0, 50), (50, 0), (1, 1)))]
+)
 def test_values_and_gradients_evaluated_together_are_those_of_the_plain_field(counts: tuple[int, int]) -> None:
     p, q = points_around(counts[0]), points_around(counts[1], seed=2)
     plain, ours = make_field("torch", torch.float64), make_field("triton")
@@ -38,7 +40,7 @@ def test_values_and_gradients_evaluated_together_are_those_of_the_plain_field(co
             assert b.numel() == 0 or float((a - b).abs().max()) <= 1e-5 * max(float(b.abs().max()), 1.0)
 
 
-@pytest.mark.parametrize("last", [0, 9])
+@pytest.mark.parametrize("last", [pytest.param(0, marks=pytest.mark.slow), 9])
 def test_the_graph_of_a_step_goes_with_its_results(last: int) -> None:
     """A cycle would keep its memory, and tie gradients to the stream where it was made: no step could be recorded."""
     field, p = make_field("triton"), points_around(20).float()

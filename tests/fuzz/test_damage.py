@@ -175,6 +175,7 @@ def pixels(scan):
     return [scan.read_pattern(), *frames]
 
 
+@pytest.mark.slow
 @few
 @given(data=st.data())
 def test_impossible_values_are_refused(original, root, data):
@@ -210,6 +211,7 @@ def test_missing_values_are_refused(original, root, data):
     assert faults or frame or bar_is_gone or place[-1] in OPTIONAL, f"without {place} it was accepted"
 
 
+@pytest.mark.slow
 @few
 @given(data=st.data())
 def test_a_damaged_file_is_refused_or_holds_the_same(original, root, data):

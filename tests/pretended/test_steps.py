@@ -106,7 +106,8 @@ def test_a_pixel_table_that_does_not_fit_gives_the_batches_of_one_on_the_host(be
                     torch.testing.assert_close(there.cpu(), values, rtol=0, atol=0, equal_nan=True, msg=name)
 
 
-@pytest.mark.parametrize("backend", ["torch", pytest.param("triton", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("backend", ["torch", "triton"])
 def test_kernels_and_recording_stay_where_the_pixel_table_does_not_fit(begin, monkeypatch, backend):
     def trained(recorded):
         with PretendedGpu(kernels=backend == "triton") as gpu:

@@ -279,7 +279,7 @@ def two_poses(k: int, coords: np.ndarray, true_first: bool) -> FrameCloud:
     return frame_cloud(f"frame_{k:05d}", coords, *DEVICES, replace(first, alternatives=(second,)))
 
 
-@pytest.mark.parametrize("true_first", [False, True])
+@pytest.mark.parametrize("true_first", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_the_true_pose_is_chosen_by_what_the_neighbours_saw(true_first):
     frame = two_poses(OPEN, IMAGES[OPEN], true_first)
     assert len(frame.alternatives) == 1
