@@ -176,7 +176,8 @@ class Studio:
 
     def _rendered(self, scene: Any, integrator: Any, samples: int, seed: int) -> Float32[ndarray, "h w 3"]:
         image = self._mi.render(scene, integrator=integrator, spp=samples, seed=seed)
-        return np.array(image, dtype=np.float32)[..., :3]
+        # a path along a triangle has no direction and no value: it counts as dark
+        return np.nan_to_num(np.array(image, dtype=np.float32)[..., :3], nan=0.0)
 
     def _put(self, scene: Any, values: dict[str, Any]) -> None:
         parameters = self._mi.traverse(scene)

@@ -33,10 +33,11 @@ from sl_nerfstudio.registration.pairs import (
 from sl_nerfstudio.registration.pose_graph import Component, EdgeArrays, Pivots, optimise_at_places
 from sl_nerfstudio.registration.register import LARGEST_SIGMA_ROTATION_DEG
 
-PARTNERS = 3  # kept frames with which each frame is registered
+PARTNER_ANGLES_DEG = 0.0, 20.0, 40.0  # to kept frames it is registered with: near ones are found, far ones stop drift
+PARTNERS = len(PARTNER_ANGLES_DEG)
 OTHERS = 5  # kept frames around those, by which a place is judged as well
 RECENT = 8  # kept frames of late: one partner is older, where there is one, so that loops close
-LEAST_FACING = 0.5  # cosine between lines of sight of a frame and a partner
+LARGEST_ANGLE_DEG = 60.0  # between lines of sight of a frame and a partner
 NEAR_AFTER = 2  # frames without a certain place, after which it is looked for everywhere first
 COMPARED = 10  # kept frames of which those that look most like a frame are partners, when it is lost
 LEAST_CONFIRMING = 2  # pairs, or frames one after the other, that must say a place after a loss
@@ -250,16 +251,18 @@ class Tracker:
         return _first()
 
     def _near(self, S_world_camera: Similarity) -> list[int]:
-        """Kept frames that look the same way as a camera: the nearest, and one that is older."""
+        """Kept frames that look nearly the same way as a camera, at several angles to it; and one that is older."""
         numbers = list(self.model.nodes)
         sight = np.array([S.R[:, 2] for S in self.model.nodes.values()], dtype=np.float64)
-        cosine = sight @ np.asarray(S_world_camera.R[:, 2], dtype=np.float64)
-        order = [numbers[k] for k in np.argsort(-cosine, kind="stable") if cosine[k] > LEAST_FACING]
-        chosen = order[:PARTNERS]
-        old = [k for k in order if k < len(numbers) - RECENT]
+        angle = np.degrees(np.arccos(np.clip(sight @ np.asarray(S_world_camera.R[:, 2], dtype=np.float64), -1, 1)))
+        facing = [k for k in np.argsort(angle, kind="stable").tolist() if angle[k] < LARGEST_ANGLE_DEG]
+        chosen: list[int] = []
+        for wanted in PARTNER_ANGLES_DEG[: len(facing)]:
+            chosen.append(min((k for k in facing if k not in chosen), key=lambda k: abs(angle[k] - wanted)))
+        old = [k for k in facing if k < len(numbers) - RECENT]
         if old and not any(k in chosen for k in old):
             chosen = [*chosen[: PARTNERS - 1], old[0]]
-        return chosen
+        return [numbers[k] for k in chosen]
 
     def _alike(self, frame: Frame, rng: np.random.Generator) -> list[int]:
         """Kept frames that look most like a frame; some of many are compared, others for the next frame."""
