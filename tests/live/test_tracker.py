@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from sl_nerfstudio.geometry.lie import Similarity
 from sl_nerfstudio.live.sight import Fault
 from sl_nerfstudio.live.tracker import Doubt, Placed, State, Tracker
 from tests.live.walks import RIG, blind, seen, sights
@@ -34,6 +36,18 @@ def errors(tracker, places: list[int]):
     """Of the kept frames: degrees, shares of the distance, scales."""
     poses = tracker.model.poses
     return errors_against(part_of(RIG, places), poses.T_world_camera, poses.baseline)
+
+
+def test_partners_are_near_and_far_and_one_of_them_is_old() -> None:
+    def turned(degrees: float) -> Similarity:
+        return Similarity(1.0, Rotation.from_euler("y", degrees, degrees=True).as_matrix(), np.zeros(3))
+
+    tracker = Tracker()
+    tracker.model.nodes = {k: turned(12.0 * k) for k in range(28)}  # 0 to 324 degrees
+    assert tracker._near(turned(181.0)) == [15, 17, 12]  # at 1, 23 and 37 degrees
+    assert tracker._near(turned(325.0)) == [27, 25, 0]  # at 1 and 25 degrees; instead of 24 at 37, the old 0 at 35
+    tracker.model.nodes = {0: turned(0.0), 1: turned(10.0)}
+    assert tracker._near(turned(61.0)) == [1] and tracker._near(turned(200.0)) == []
 
 
 @pytest.fixture(scope="module")
