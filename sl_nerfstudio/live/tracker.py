@@ -134,6 +134,11 @@ class Model:
             projectors[k] = S.poses(self.kept[k].T_camera_projector)
         return DevicePoses(cameras, projectors)
 
+    def angles_deg(self, S_world_camera: Similarity) -> Float64[ndarray, "n"]:
+        """Between the lines of sight of the kept frames and that of a camera."""
+        sight = np.array([S.R[:, 2] for S in self.nodes.values()], dtype=np.float64)
+        return np.degrees(np.arccos(np.clip(sight @ S_world_camera.R[:, 2], -1, 1)))
+
     def draw(self) -> None:
         """Bring the surface to where the kept frames are; all of it where one has moved too far."""
         size = self.kept[0].frame.map.radius / CELLS
@@ -252,17 +257,15 @@ class Tracker:
 
     def _near(self, S_world_camera: Similarity) -> list[int]:
         """Kept frames that look nearly the same way as a camera, at several angles to it; and one that is older."""
-        numbers = list(self.model.nodes)
-        sight = np.array([S.R[:, 2] for S in self.model.nodes.values()], dtype=np.float64)
-        angle = np.degrees(np.arccos(np.clip(sight @ np.asarray(S_world_camera.R[:, 2], dtype=np.float64), -1, 1)))
+        angle = self.model.angles_deg(S_world_camera)
         facing = [k for k in np.argsort(angle, kind="stable").tolist() if angle[k] < LARGEST_ANGLE_DEG]
         chosen: list[int] = []
         for wanted in PARTNER_ANGLES_DEG[: len(facing)]:
             chosen.append(min((k for k in facing if k not in chosen), key=lambda k: abs(angle[k] - wanted)))
-        old = [k for k in facing if k < len(numbers) - RECENT]
+        old = [k for k in facing if k < len(angle) - RECENT]
         if old and not any(k in chosen for k in old):
             chosen = [*chosen[: PARTNERS - 1], old[0]]
-        return [numbers[k] for k in chosen]
+        return chosen
 
     def _alike(self, frame: Frame, rng: np.random.Generator) -> list[int]:
         """Kept frames that look most like a frame; some of many are compared, others for the next frame."""
@@ -347,13 +350,12 @@ class Tracker:
         covariance = EdgeArrays.of(edges).covariance_of(len(pivots) - 1, pivots)
         c, radius = sight.frame.map.centroid, sight.frame.map.radius
         J = np.concatenate([radius * np.eye(3), np.cross(np.eye(3), -c).T, -c[:, None]], 1)  # of the camera's centre
-        seen = np.array([other.R[:, 2] for other in self.model.nodes.values()]) @ S.R[:, 2]
         return Placed(
             State.TRACKED, None, S, covariance,
             float(np.degrees(np.sqrt(np.trace(covariance[3:6, 3:6])))),
             float(S.scale * np.sqrt(np.trace(J @ covariance @ J.T))),
             self.model.surfels.thin_share(sight.frame.map, S),
-            float(np.degrees(np.arccos(np.clip(seen.max(), -1, 1)))),
+            float(self.model.angles_deg(S).min()),
         )  # fmt: skip
 
     def _doubt(
