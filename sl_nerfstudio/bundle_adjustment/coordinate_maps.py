@@ -492,6 +492,15 @@ class CoordinateMaps:
                 found[mine] = np.where(pixel[mine] >= 0, np.minimum(steps.ravel()[pixel[mine]], FARTHEST), 0)
         return torch.from_numpy(found)
 
+    def decoded(self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"]) -> Bool[Tensor, "n"]:
+        """Whether the pixels at positions in the camera images of `frame` have a coordinate."""
+        words, first, widths, heights = self.arrays[1]
+        j, (x, y) = frame.numpy(), uv_camera.numpy().T
+        inside = (x >= 0) & (y >= 0) & (x < widths[j]) & (y < heights[j])
+        column, row = (np.where(inside, part, 0).astype(np.int64) for part in (x, y))
+        word = words[first[j] + row * words_of(widths[j]) + column // WORD, 0]
+        return torch.from_numpy(inside & (word >> (column % WORD).astype(np.uint64) & _ONE == _ONE))
+
     def look_up(
         self, frame: Int[Tensor, "n"], uv_camera: Float[Tensor, "n 2"], memory: WindowMemory | None = None
     ) -> MapSample:

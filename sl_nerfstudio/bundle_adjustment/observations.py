@@ -145,7 +145,14 @@ def anchors_at(
 
     `seen` is what was decoded there.
     """
-    p, normal, good = _surface(rig, frame, uv, seen)
+    return anchors_on(rig, frame, seen, surface_rays(rig, frame, uv, seen))
+
+
+def anchors_on(
+    rig: Rig, frame: Int[Tensor, "n"], seen: MapSample, rays: tuple[Float[Tensor, "5 n 3"], Float[Tensor, "5 n 3"]]
+) -> tuple[Anchors, Bool[Tensor, "n"]]:
+    """Anchors at decoded pixels, by their `surface_rays`; whether these can be used, as `anchors_at` has it."""
+    p, normal, good = _surface(rig, frame, rays)
     depth = p.norm(dim=-1)
     return Anchors(frame, p / depth[:, None], seen.uv_projector, depth, normal, seen.roughness), seen.valid & good
 
@@ -160,7 +167,7 @@ def with_common_normals(rig: Rig, anchors: Anchors, rows: Observations, maps: Co
     own_uv, (uv, _) = project(rig.camera[anchors.frame], anchors.d_camera)[0], pixels_of_rows(rig, anchors, rows)
     frame = torch.cat([anchors.frame, rows.frame])
     seen = maps.for_normals.look_up(frame, torch.cat([own_uv, uv]))
-    _, normal, good = _surface(rig, frame, torch.cat([own_uv, uv]), seen)
+    _, normal, good = _surface(rig, frame, surface_rays(rig, frame, torch.cat([own_uv, uv]), seen))
     good &= seen.valid
     normal = rotate(rig.T_world_camera[frame], normal)
     count = len(anchors.frame)
@@ -173,18 +180,29 @@ def with_common_normals(rig: Rig, anchors: Anchors, rows: Observations, maps: Co
     return replace(anchors, normal=rotate(inverse(rig.T_world_camera)[anchors.frame], total))
 
 
-def _surface(
+def surface_rays(
     rig: Rig, frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"], seen: MapSample
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
-    """Points where rays meet, normals towards the camera, in its axes; whether they meet in front of both devices."""
-    p, _, good = where_rays_meet(rig, frame, uv, seen.uv_projector)
-    edges = []
+) -> tuple[Float[Tensor, "5 n 3"], Float[Tensor, "5 n 3"]]:
+    """Rays of the camera and of the projector, each in its axes, through pixels and places to both sides of them.
+
+    In the order: pixel; a little right and left of it; a little below and above it. They do not depend on poses.
+    """
+    at, theirs = [uv], [seen.uv_projector]
     for axis in range(2):
         step, change = _STEP * torch.eye(2, dtype=uv.dtype)[axis], _STEP * seen.jacobian[..., axis]
-        far = where_rays_meet(rig, frame, uv + step, seen.uv_projector + change)[0]
-        edges.append(far - where_rays_meet(rig, frame, uv - step, seen.uv_projector - change)[0])
-    normal = torch.nn.functional.normalize(torch.linalg.cross(edges[0], edges[1]), dim=-1)
-    return p, -normal * (normal * p).sum(-1, keepdim=True).sign(), good
+        at += [uv + step, uv - step]
+        theirs += [seen.uv_projector + change, seen.uv_projector - change]
+    return unproject(rig.camera[frame], torch.stack(at)), unproject(rig.projector, torch.stack(theirs))
+
+
+def _surface(
+    rig: Rig, frame: Int[Tensor, "n"], rays: tuple[Float[Tensor, "5 n 3"], Float[Tensor, "5 n 3"]]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Bool[Tensor, "n"]]:
+    """Points where `surface_rays` meet, normals towards the camera, in its axes; whether both devices see them."""
+    points, _, good = _meeting(rig, frame, *rays)
+    p, right, left, below, above = points
+    normal = torch.nn.functional.normalize(torch.linalg.cross(right - left, below - above), dim=-1)
+    return p, -normal * (normal * p).sum(-1, keepdim=True).sign(), good[0]
 
 
 def in_front_of(rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps) -> Bool[Tensor, "rows"]:
@@ -202,10 +220,15 @@ def where_rays_meet(
 
     And whether they are in front of both devices.
     """
-    d_camera = unproject(rig.camera[frame], uv_camera)
+    return _meeting(rig, frame, unproject(rig.camera[frame], uv_camera), unproject(rig.projector, uv_projector))
+
+
+def _meeting(
+    rig: Rig, frame: Int[Tensor, "n"], d_camera: Float[Tensor, "*batch n 3"], d_projector: Float[Tensor, "*batch n 3"]
+) -> tuple[Float[Tensor, "*batch n 3"], Float[Tensor, "*batch n"], Bool[Tensor, "*batch n"]]:
+    """The same of rays, each in the axes of its device."""
     T = rig.T_camera_projector[frame]
-    d_projector = rotate(T, unproject(rig.projector, uv_projector))
-    depth, depth_projector = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], d_projector)
+    depth, depth_projector = closest_approach(torch.zeros_like(d_camera), d_camera, T[:, :3, 3], rotate(T, d_projector))
     return depth[..., None] * d_camera, depth, (depth > 0) & (depth_projector > 0)
 
 
@@ -324,15 +347,37 @@ def _visible(
     allowed: Bool[Tensor, "frames frames"],
 ) -> Bool[ndarray, "frames anchors"]:
     """Which frames decoded something near which anchors."""
-    T, n = rig.T_world_camera[anchors.frame], len(anchors.frame)
-    p_world, normal = transform(T, anchors.depth[:, None] * anchors.d_camera), rotate(T, anchors.normal)
-    centres = torch.stack([rig.T_world_camera[:, :3, 3], rig.T_world_projector[:, :3, 3]])
-    visible = np.empty((rig.frames, n), dtype=np.bool_)
+    p_world, normal = _in_world(rig, anchors)
+    visible = np.empty((rig.frames, len(anchors.frame)), dtype=np.bool_)
     mark_visible(
-        rig.frames, rig.arrays, maps.arrays, array(anchors.frame), array(p_world), array(normal), array(centres),
+        rig.frames, rig.arrays, maps.arrays, array(anchors.frame), array(p_world), array(normal), array(_centres(rig)),
         array(allowed), limits, visible,
     )  # fmt: skip
     return visible
+
+
+def visible_rows(
+    rig: Rig, anchors: Anchors, rows: Observations, maps: CoordinateMaps, least_cosine: float
+) -> Bool[Tensor, "rows"]:
+    """Whether frames decoded something at the anchors that they look up and face their surface, as `observe` asks."""
+    uv, in_front = pixels_of_rows(rig, anchors, rows)
+    seen = in_front & maps.decoded(rows.frame, uv)
+    p_world, normal = (part[rows.anchor] for part in _in_world(rig, anchors))
+    for centre in _centres(rig):
+        towards = centre[rows.frame] - p_world
+        seen &= (normal * towards).sum(-1) > least_cosine * towards.norm(dim=-1) * normal.norm(dim=-1)
+    return seen
+
+
+def _in_world(rig: Rig, anchors: Anchors) -> tuple[Float[Tensor, "anchors 3"], Float[Tensor, "anchors 3"]]:
+    """Points and normals of anchors."""
+    T = rig.T_world_camera[anchors.frame]
+    return transform(T, anchors.depth[:, None] * anchors.d_camera), rotate(T, anchors.normal)
+
+
+def _centres(rig: Rig) -> Float[Tensor, "2 frames 3"]:
+    """Where cameras and projectors are."""
+    return torch.stack([rig.T_world_camera[:, :3, 3], rig.T_world_projector[:, :3, 3]])
 
 
 # The robust kernel: its width shrinks with the residuals (graduated non-convexity: Yang et al., RA-L 2020), separately

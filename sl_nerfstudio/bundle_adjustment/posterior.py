@@ -18,7 +18,15 @@ from torch import Tensor
 
 from sl_nerfstudio.bundle_adjustment.coordinate_maps import CoordinateMaps, MapSample
 from sl_nerfstudio.bundle_adjustment.normal_equations import normal_equations
-from sl_nerfstudio.bundle_adjustment.observations import anchors_at, in_front_of, observe, partners
+from sl_nerfstudio.bundle_adjustment.observations import (
+    anchors_at,
+    anchors_on,
+    in_front_of,
+    observe,
+    partners,
+    surface_rays,
+    visible_rows,
+)
 from sl_nerfstudio.bundle_adjustment.parameters import (
     PosePrior,
     PriorTerm,
@@ -51,9 +59,9 @@ from sl_nerfstudio.geometry.numerics import geman_mcclure_cost
 from sl_nerfstudio.parallel import results
 
 _COMPARED_ANCHORS = 300  # decoded pixels of each frame that are looked up
-_FRAME_ANCHORS = 1500  # the same of a frame that alone is in question
+_FRAME_ANCHORS = 6000  # the same of a frame that alone is in question
 _OF_OTHERS = 25  # one in so many of those of the other frames, or in as many as there are frames, if these are more
-_FRAME_LOOK_UPS = 12_000  # of all of them, at most
+_FRAME_LOOK_UPS = 24_000  # of all of them, at most
 _COMPARED_NOISES = 4.0  # residual at which a look-up costs half of what a contradiction costs
 _NATS = _COMPARED_NOISES**2 / 2  # cost of a look-up that contradicts, however far off it is
 _HIDDEN = 2.0  # widths of the kernel from which on a nearer surface is another one, which hides the anchor
@@ -99,10 +107,12 @@ def odds(problem: SearchProblem, one: Rig, two: Rig, noise: float) -> Odds:
     ends = [_End(one, mine, both), _End(two, theirs, both)]
     allowed = torch.stack([end.partners(problem.maps, generator) for end in ends]).any(0)
     first, second = (end.numbers(problem.maps, allowed, generator) for end in ends)
-    rows = _common(one.frames, first, second, EVERY_FRAME_PER_ANCHOR * int(both.sum()), generator)
-    gain, block, common = _gains(problem.maps, ends, rows, noise, uv)
-    share = min(INDEPENDENT * one.frames / max(common, 1), 1.0)
-    mean, error = mean_and_error(share * gain, block)
+    shared = first[torch.isin(first, second)]
+    rows = _some(one.frames, shared, EVERY_FRAME_PER_ANCHOR * int(both.sum()), generator)
+    own, cross, common = _gains(problem.maps, ends, rows, noise)
+    share = min(INDEPENDENT * one.frames / max(len(cross), 1), 1.0)
+    gain, block = share * torch.cat([own[both], cross]), _blocks(frame, uv)
+    mean, error = mean_and_error(gain, torch.cat([block[both], block[rows.anchor[common]]]))
     prior = prior_cost(problem.prior, problem.start, two) - prior_cost(problem.prior, problem.start, one)
     return Odds(mean * len(gain), prior, error * len(gain))
 
@@ -128,33 +138,39 @@ class _End:
         return index[rows.anchor] * n + rows.frame
 
 
-def _common(
-    frames: int, first: Int[Tensor, "n"], second: Int[Tensor, "m"], most: int, generator: torch.Generator
-) -> Observations:
-    """Look-ups, by their numbers, that exist at both of two rigs; a random choice if there are too many."""
-    common = first[torch.isin(first, second)]
-    chosen = common[torch.randperm(len(common), generator=generator)[:most].sort().values]
+def _some(frames: int, numbers: Int[Tensor, "n"], most: int, generator: torch.Generator) -> Observations:
+    """Look-ups by their numbers; a random choice if there are too many."""
+    chosen = numbers[torch.randperm(len(numbers), generator=generator)[:most].sort().values]
     return Observations(chosen // frames, chosen % frames)
 
 
 def _gains(
-    maps: CoordinateMaps, ends: list[_End], rows: Observations, noise: float, uv: Float[Tensor, "anchors 2"]
-) -> tuple[Float[Tensor, "gains"], Int[Tensor, "gains"], int]:
-    """What the first of two rigs gains over the second, nats, with the block of the image of each gain.
+    maps: CoordinateMaps, ends: list[_End], rows: Observations, noise: float
+) -> tuple[Float[Tensor, "anchors"], Float[Tensor, "common"], Bool[Tensor, "rows"]]:
+    """What the first of two rigs gains over the second, nats.
 
-    Gains of the decoded pixels' own residuals, then of look-ups that exist at both; and the number of the latter.
+    By the own residuals of anchors, which count where both rigs have them; then by look-ups that exist at both; and
+    which these are.
     """
     found = [residuals_of(end.rig, end.anchors, rows, maps) for end in ends]
     width, both = _COMPARED_NOISES * noise, ends[0].good & ends[1].good
-    common = found[0].cross_valid & found[1].cross_valid
+    common = found[0].cross_valid & found[1].cross_valid & both[rows.anchor]
     for end, r in zip(ends, found, strict=True):
         far = (common & (r.cross.norm(dim=-1) > _HIDDEN * width)).nonzero()[:, 0]
         hidden = in_front_of(end.rig, end.anchors, Observations(rows.anchor[far], rows.frame[far]), maps)
         common[far[hidden]] = False
-    costs = [geman_mcclure_cost((torch.cat([r.own[both], r.cross[common]]) / width).square().sum(-1)) for r in found]
+
+    def cost(residual: Float[Tensor, "n 2"]) -> Float[Tensor, "n"]:
+        return _NATS * geman_mcclure_cost((residual / width).square().sum(-1))
+
+    first, second = found
+    return cost(second.own) - cost(first.own), cost(second.cross[common]) - cost(first.cross[common]), common
+
+
+def _blocks(frame: Int[Tensor, "n"], uv: Float[Tensor, "n 2"]) -> Int[Tensor, "n"]:
+    """Number of the block of an image in which each pixel is: what is decoded in one may err alike."""
     cell = (uv / _BLOCK).long()
-    block = (ends[0].anchors.frame * _MOST_CELLS + cell[:, 1]) * _MOST_CELLS + cell[:, 0]
-    return _NATS * (costs[1] - costs[0]), torch.cat([block[both], block[rows.anchor[common]]]), int(common.sum())
+    return (frame * _MOST_CELLS + cell[:, 1]) * _MOST_CELLS + cell[:, 0]
 
 
 def prior_cost(prior: PosePrior, start: Rig, rig: Rig) -> float:
@@ -216,10 +232,12 @@ def with_slides(
     """The covariance's factor, wider by how far some of the frames may have slid, each by itself."""
     n, rig = found.state.rig.frames, found.state.rig
     directions, pixels = least_known_motions(problem, refine, found), many_pixels(problem)
+    generator = torch.Generator().manual_seed(problem.settings.seed)
+    allowed = partners(rig, found.state.anchors, problem.maps, PARTNERS, LEAST_COSINE, generator)
     motions = torch.zeros(len(frames), 2, n, 6, dtype=torch.float64)
 
     def slid(motion: Float[Tensor, "2 frames 6"], k: int) -> float:
-        place = PlaceOfFrame.of(problem, rig, found.noise, k, pixels)
+        place = PlaceOfFrame.of(problem, rig, found.noise, k, pixels, allowed)
         sigma = float((motion.flatten() @ factor[: 12 * n]).norm())
         prior = float((directions[k] / problem.prior.sigma[k]).norm().reciprocal())
         return how_far(lambda d: place.lead_of(rig.moved(d * motion[0], d * motion[1])), sigma, prior)
@@ -248,38 +266,47 @@ class PlaceOfFrame:
     problem: SearchProblem
     noise: float  # of one look-up, projector pixels
     here: _End
-    uv: Float[Tensor, "anchors 2"]  # the anchors' pixels
-    seen: MapSample  # what was decoded at those
-    allowed: Bool[Tensor, "frames frames"]  # which frames look up whose anchors
-    numbers: Int[Tensor, "rows"]  # of the look-ups here
+    block: Int[Tensor, "anchors"]  # of an image, in which each is
+    its: Bool[Tensor, "anchors"]  # those of the frame itself
+    seen: MapSample  # what was decoded at these
+    rays: tuple[Float[Tensor, "5 its 3"], Float[Tensor, "5 its 3"]]  # their `surface_rays`
+    rows: Observations  # look-ups here
 
     @staticmethod
     def of(
         problem: SearchProblem, rig: Rig, noise: float, frame: int,
-        pixels: tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]],
+        pixels: tuple[Int[Tensor, "n"], Float[Tensor, "n 2"]], allowed: Bool[Tensor, "frames frames"],
     ) -> "PlaceOfFrame":  # fmt: skip
-        """`pixels` are the `many_pixels` of all frames."""
+        """`pixels` are the `many_pixels` of all frames; `allowed` says which frames may look up anchors of which."""
         owner, uv = pixels
         chosen = owner == frame
         chosen[:: max(_OF_OTHERS, rig.frames)] = True
         owner, uv = owner[chosen], uv[chosen]
-        seen = problem.maps.look_up(owner, uv)
-        here = _End(rig, *anchors_at(rig, owner, uv, seen))
+        here = _End(rig, *anchors_at(rig, owner, uv, problem.maps.look_up(owner, uv)))
         generator = torch.Generator().manual_seed(problem.settings.seed)
-        its = torch.arange(rig.frames) == frame
-        allowed = here.partners(problem.maps, generator) & (its | its[:, None])
-        numbers = here.numbers(problem.maps, allowed, generator)
-        return PlaceOfFrame(problem, noise, here, uv, seen, allowed, numbers)
+        own = torch.arange(rig.frames) == frame
+        numbers = here.numbers(problem.maps, allowed & (own | own[:, None]), generator)
+        rows = _some(rig.frames, numbers, _FRAME_LOOK_UPS, generator)
+        its = owner == frame
+        seen = problem.maps.look_up(owner[its], uv[its])
+        rays = surface_rays(rig, owner[its], uv[its], seen)
+        return PlaceOfFrame(problem, noise, here, _blocks(owner, uv), its, seen, rays, rows)
 
     def lead_of(self, other: Rig) -> float:
         """By how many of its standard errors a rig in which that frame alone is elsewhere is more probable."""
-        maps, generator = self.problem.maps, torch.Generator().manual_seed(self.problem.settings.seed)
-        there = _End(other, *anchors_at(other, self.here.anchors.frame, self.uv, self.seen))
-        numbers = there.numbers(maps, self.allowed, generator)
-        rows = _common(other.frames, self.numbers, numbers, _FRAME_LOOK_UPS, generator)
-        gain, block, _ = _gains(maps, [there, self.here], rows, self.noise, self.uv)
-        mean, error = mean_and_error(gain, block)
+        maps, there, its = self.problem.maps, self._moved(other), self.its
+        own, cross, common = _gains(maps, [there, self.here], self.rows, self.noise)
+        seen = visible_rows(other, there.anchors, self.rows, maps, LEAST_COSINE)[common]
+        both = its & there.good & self.here.good
+        block = torch.cat([self.block[both], self.block[self.rows.anchor[common][seen]]])
+        mean, error = mean_and_error(torch.cat([own[both], cross[seen]]), block)
         return mean / error if error > 0 else 0.0
+
+    def _moved(self, other: Rig) -> _End:
+        """The same pixels as anchors of a rig in which that frame alone is elsewhere."""
+        here, its = self.here, self.its
+        anchors, good = anchors_on(other, here.anchors.frame[its], self.seen, self.rays)
+        return _End(other, here.anchors.replaced(its, anchors), here.good.masked_scatter(its, good))
 
 
 def least_known_motions(

@@ -234,6 +234,13 @@ class Anchors:
         """Choose anchors by mask or by index."""
         return Anchors(*(getattr(self, f.name)[index] for f in fields(self)))
 
+    def replaced(self, where: Bool[Tensor, "anchors"], by: "Anchors") -> "Anchors":
+        """Put others in the place of some."""
+        parts = {f.name: getattr(self, f.name).clone() for f in fields(self)}
+        for name, part in parts.items():
+            part[where] = getattr(by, name)
+        return Anchors(**parts)
+
 
 @dataclass(frozen=True)
 class Observations:

@@ -100,6 +100,7 @@ class Intrinsics:
 
 Number = Any  # a tensor, or a float in compiled loops
 UNDISTORT_STEPS, LEAST_DETERMINANT = 12, 1e-9
+_LAST_STEP = 1e-9  # after which the next would be below rounding: each is the square of the one before
 
 
 def distort(x: Number, y: Number, k1: Number, k2: Number, p1: Number, p2: Number) -> tuple[Number, Number]:
@@ -133,8 +134,10 @@ def undistort(xd: Tensor, yd: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Te
         a, b, d = distortion_jacobian(x, y, k1, k2, p1, p2)
         det = a * d - b * b
         det = torch.where(det.abs() < LEAST_DETERMINANT, torch.full_like(det, LEAST_DETERMINANT), det)
-        x = x - (d * ex - b * ey) / det
-        y = y - (a * ey - b * ex) / det
+        step_x, step_y = (d * ex - b * ey) / det, (a * ey - b * ex) / det
+        x, y = x - step_x, y - step_y
+        if torch.maximum(step_x.detach().abs(), step_y.detach().abs()).lt(_LAST_STEP).all():
+            break
     return x, y
 
 

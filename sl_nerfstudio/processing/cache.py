@@ -52,7 +52,7 @@ VERSIONS = {
     "test of intrinsics": 1,  # relative_pose/intrinsics.py
     "static projector": 1,  # registration/static_projector.py
     "registration": 7,  # registration/
-    "adjustment": 12,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
+    "adjustment": 13,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
 }
 """Number of each stage. Raise it whenever the stage, or anything that it calls, may give another result from the same
 inputs: another algorithm, constant, order of summation or field of a result. Names, comments and speed need none.

@@ -180,7 +180,14 @@ def test_every_pixel_is_found_among_the_decoded_ones(sizes, seed):
             place, known = place_of(words, row_word, column), np.isfinite(image[row, column, 0])
             assert is_known(words, row_word, column) == (place >= 0) == known
             assert place < 0 or (values[place] == image[row, column]).all()
+        rows, columns = np.indices(image.shape[:2])
+        uv = np.stack([columns, rows], -1).reshape(-1, 2) + rng.random((rows.size, 2))
+        at = torch.full((len(uv),), frame)
+        assert np.array_equal(maps.decoded(at, torch.from_numpy(uv)).numpy(), np.isfinite(image[..., 0]).ravel())
     assert len(values) == sum(np.isfinite(image[..., 0]).sum() for image in images)
+    h, w = images[0].shape[:2]
+    outside = torch.tensor([[-0.1, 0.5], [0.5, -0.1], [w, 0.5], [0.5, h], [NAN, 0.5]], dtype=torch.float64)
+    assert not maps.decoded(torch.zeros(5, dtype=torch.int64), outside).any()
 
 
 def test_images_are_visited_one_after_the_other():

@@ -19,9 +19,10 @@ from sl_nerfstudio.bundle_adjustment.observations import (
     partners,
     place_anchors,
     useful_distance,
+    visible_rows,
     with_common_normals,
 )
-from sl_nerfstudio.bundle_adjustment.residuals import Residuals
+from sl_nerfstudio.bundle_adjustment.residuals import Observations, Residuals
 from sl_nerfstudio.geometry.lie import rotate, transform
 
 from . import analytic
@@ -85,6 +86,18 @@ def test_without_a_gate_no_coordinate_is_read(scene):
     assert torch.equal(a.anchor, b.anchor) and torch.equal(a.frame, b.frame) and len(a.anchor) > 100
     gated = observe(rig, anchors, blank, 3, 4.0, 0.1, torch.Generator().manual_seed(1))
     assert len(gated.anchor) < len(a.anchor)  # a gate needs them
+
+
+def test_single_look_ups_exist_where_frames_find_them(scene):
+    rig, maps, anchors = scene
+    count = len(anchors.frame)
+    every = Observations(torch.arange(count).repeat_interleave(FRAMES), torch.arange(FRAMES).repeat(count))
+    found = observe(rig, anchors, maps, FRAMES, ALL, 0.3, torch.Generator().manual_seed(1))
+    seen = visible_rows(rig, anchors, every, maps, 0.3).reshape(count, FRAMES)
+    seen[torch.arange(count), anchors.frame] = False  # no frame looks up its own
+    expected = torch.zeros_like(seen)
+    expected[found.anchor, found.frame] = True
+    assert torch.equal(seen, expected) and seen.any(0).all() and not seen.all(0).any()
 
 
 def test_surfaces_seen_at_a_flat_angle_are_left_out(scene):
