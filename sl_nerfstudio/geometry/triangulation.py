@@ -42,7 +42,7 @@ def world_pixels(
     return uv.numpy(), in_front.numpy() & (u >= 0) & (v >= 0) & (u < device.w) & (v < device.h)
 
 
-_PARALLEL = 1e-12  # sin^2 of the angle between rays, below which they count as parallel
+PARALLEL = 1e-12  # sin^2 of the angle between rays, below which they count as parallel
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def closest_approach(
     # Cross products, because 1 - cos^2 of the angle would lose all digits of float32 at small baselines.
     normal = torch.linalg.cross(d1, d2)
     sin2 = (normal * normal).sum(-1)
-    scaled = normal / torch.where(sin2 > _PARALLEL, sin2, torch.nan)[..., None]
+    scaled = normal / torch.where(sin2 > PARALLEL, sin2, torch.nan)[..., None]
     return (torch.linalg.cross(between, d2) * scaled).sum(-1), (torch.linalg.cross(between, d1) * scaled).sum(-1)
 
 

@@ -5,14 +5,12 @@ from functools import cached_property
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
-from sl_nerfstudio.geometry.devices import Device, Intrinsics, for_loops
+from sl_nerfstudio.geometry.devices import Device, for_loops
 from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, nearest_distances, solve_plane
-from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.parallel import compiled_range
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
 from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError, agreeing_coords
@@ -113,20 +111,9 @@ def frame_cloud(
             "    cause:  too little of the pattern was decoded\n"
             "    remedy: capture this view again"
         )
-    T = torch.from_numpy(pose.T_camera_projector)
-    found = triangulate(
-        Intrinsics.of(camera, torch.float64),
-        torch.eye(4, dtype=torch.float64),
-        torch.from_numpy(uv_camera[keep]),
-        Intrinsics.of(projector, torch.float64),
-        T,
-        torch.from_numpy(uv_projector[keep]),
-    )
     d_camera, d_projector = directions(camera, uv_camera[keep]), directions(projector, uv_projector[keep])
+    depth, depth_by_pixel, slopes = camera_depth_by_pose(pose.T_camera_projector, projector, d_camera, d_projector)
     # Changes of depth by one sigma of the pose along each principal axis of its covariance.
-    slopes = camera_depth_by_pose(
-        pose.T_camera_projector[:3, :3], pose.T_camera_projector[:3, 3], d_camera, d_projector
-    )
     variance, axes = np.linalg.eigh(pose.covariance)
     return FrameCloud(
         name,
@@ -136,8 +123,8 @@ def frame_cloud(
         agreeing_coords(coords, camera, projector, pose),
         uv_camera[keep],
         # On the camera ray, not midway between both rays: camera pixels are exact, coordinates are not.
-        points=d_camera * found.depth_camera.numpy()[:, None],
-        sigma_noise=pose.noise_px[keep] * found.sigma_depth.numpy(),
+        points=d_camera * depth[:, None],
+        sigma_noise=pose.noise_px[keep] * depth_by_pixel,
         pose_errors=slopes @ (axes * np.sqrt(variance.clip(0))),
         light=light,
         seen=seen,

@@ -11,8 +11,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from sl_nerfstudio.geometry.devices import Device
-from sl_nerfstudio.parallel import one_library_thread
+from sl_nerfstudio.geometry.devices import Device, for_loops, view_of
+from sl_nerfstudio.geometry.lie import cross, rotated, row_times_rotation
+from sl_nerfstudio.geometry.triangulation import PARALLEL
+from sl_nerfstudio.parallel import compiled_range, one_library_thread
 from sl_nerfstudio.relative_pose.epipolar import (
     KERNEL_SIGMAS,
     RayPairs,
@@ -67,24 +69,47 @@ def camera_depth(
 
 
 def camera_depth_by_pose(
-    R: Float64[ndarray, "3 3"],
-    t: Float64[ndarray, "3"],
+    T_camera_projector: Float64[ndarray, "4 4"],
+    projector: Device,
     d_camera: Float64[ndarray, "n 3"],
     d_projector: Float64[ndarray, "n 3"],
-) -> Float64[ndarray, "n 5"]:
-    """Derivatives of `camera_depth` by the increments (w, b) of the pose that `epipolar.moved` describes.
+) -> tuple[Float64[ndarray, "n"], Float64[ndarray, "n"], Float64[ndarray, "n 5"]]:
+    """`camera_depth`, how far it moves per pixel of the projector, and by the pose's increments of `epipolar.moved`.
 
     With p the projector's ray in camera axes, n = d x p and N = t x p, depth is N . n / n . n. The derivatives of both
-    products by p and by t are cross products; w turns p, b turns t.
+    products by p and by t are cross products; w turns p, b turns t. NaN where the rays are parallel.
     """
-    p = d_projector @ R.T
-    n, N = np.cross(d_camera, p), np.cross(t, p)
-    over = 1 / (n * n).sum(-1, keepdims=True).clip(1e-300)
-    depth = (N * n).sum(-1, keepdims=True) * over
-    by_p = over * (np.cross(n, t) + np.cross(N - 2 * depth * n, d_camera))
-    by_t = over * np.cross(p, n)
-    by_b = by_t @ (direction_basis(t)[:, ::-1] * [-1, 1])
-    return np.concatenate([np.cross(p, by_p), by_b], 1)
+    depth, by_pixel, by_pose = np.empty(len(d_camera)), np.empty(len(d_camera)), np.empty((len(d_camera), 5))
+    T, basis = np.ascontiguousarray(T_camera_projector), direction_basis(T_camera_projector[:3, 3])
+    by_t = np.ascontiguousarray(basis[:, ::-1] * [-1, 1])
+    _depth_by_pose(len(depth), T, *for_loops(projector), by_t, d_camera, d_projector, depth, by_pixel, by_pose)
+    return depth, by_pixel, by_pose
+
+
+@compiled_range
+def _depth_by_pose(first, last, T, code, parameters, basis, d_camera, d_projector, depth, by_pixel, by_pose):
+    t0, t1, t2 = T[0, 3], T[1, 3], T[2, 3]
+    for k in range(first, last):
+        d0, d1, d2 = d_camera[k, 0], d_camera[k, 1], d_camera[k, 2]
+        p0, p1, p2 = rotated(T, d_projector[k, 0], d_projector[k, 1], d_projector[k, 2])
+        n0, n1, n2 = cross(d0, d1, d2, p0, p1, p2)
+        N0, N1, N2 = cross(t0, t1, t2, p0, p1, p2)
+        square = n0 * n0 + n1 * n1 + n2 * n2
+        over = 1 / square if square > PARALLEL else np.nan
+        s = (N0 * n0 + N1 * n1 + N2 * n2) * over
+        depth[k] = s
+        x, y, z = row_times_rotation(s * d0 - t0, s * d1 - t1, s * d2 - t2, T)  # the inverse of a rotation
+        _, _, _, ux, uy, uz, vx, vy, vz = view_of(code, x, y, z, parameters)
+        x, y, z = row_times_rotation(d0, d1, d2, T)
+        slope = np.hypot(ux * x + uy * y + uz * z, vx * x + vy * y + vz * z)
+        by_pixel[k] = 1 / max(slope, 1e-12)
+        a0, a1, a2 = cross(n0, n1, n2, t0, t1, t2)
+        b0, b1, b2 = cross(N0 - 2 * s * n0, N1 - 2 * s * n1, N2 - 2 * s * n2, d0, d1, d2)
+        w = cross(p0, p1, p2, over * (a0 + b0), over * (a1 + b1), over * (a2 + b2))
+        c0, c1, c2 = cross(p0, p1, p2, n0, n1, n2)
+        by_pose[k, 0], by_pose[k, 1], by_pose[k, 2] = w
+        for j in range(2):
+            by_pose[k, 3 + j] = over * (c0 * basis[0, j] + c1 * basis[1, j] + c2 * basis[2, j])
 
 
 # A camera whose focal length is only roughly known.

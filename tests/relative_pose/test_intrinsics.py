@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sl_nerfstudio.calibration.stated import StatedSigma
-from sl_nerfstudio.geometry.devices import Device, DeviceChange
+from sl_nerfstudio.geometry.devices import Device, DeviceChange, Intrinsics, project
 from sl_nerfstudio.geometry.triangulation import closest_approach
 from sl_nerfstudio.relative_pose.epipolar import moved
 from sl_nerfstudio.relative_pose.estimation import estimate_relative_pose
@@ -42,7 +42,15 @@ def test_depth_is_where_the_rays_come_closest_with_derivatives_by_the_pose(seed)
         (camera_depth(*moved(R, t, step), *rays) - camera_depth(*moved(R, t, -step), *rays)) / (2 * h)
         for step in h * np.eye(5)
     ]
-    found = camera_depth_by_pose(R, t, *rays)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    for projector in PROJECTORS.values():
+        depth, by_pixel, found = camera_depth_by_pose(T, projector, *rays)
+        assert depth == pytest.approx(expected.numpy(), rel=1e-9)
+        near, far = (torch.from_numpy(((depth + step)[:, None] * rays[0] - t) @ R) for step in (-h, h))
+        (low, seen), (high, _) = (project(Intrinsics.of(projector, torch.float64), point) for point in (near, far))
+        slope = (high - low).norm(dim=-1).numpy() / (2 * h)
+        assert by_pixel[seen] == pytest.approx(1 / slope[seen], rel=1e-4) and seen.any()
     scale = np.abs(found).max(0)
     np.testing.assert_allclose(found / scale, np.stack(slopes, 1) / scale, rtol=1e-4, atol=1e-7)
 
