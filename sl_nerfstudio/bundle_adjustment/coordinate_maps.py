@@ -18,6 +18,7 @@ from numpy import ndarray
 from scipy.ndimage import distance_transform_cdt
 from torch import Tensor
 
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.parallel import compiled, compiled_range, results
 from sl_nerfstudio.storage import GrowingArray, largest_in_memory
 
@@ -410,7 +411,7 @@ class CoordinateMaps:
         values, known, widths = GrowingArray(largest_in_memory()), [], []
         for image in images:
             coords = image.float().numpy()
-            finite = np.isfinite(coords).all(-1)
+            finite = all_finite(coords)
             values.append(coords[finite])
             known.append(packed(finite))
             widths.append(image.shape[1])

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from sl_nerfstudio.calibration.board_adjustment import BoardView, Corners
 from sl_nerfstudio.decoding.decoder import Decoder, DecodingError
 from sl_nerfstudio.decoding.grid import NetworkDecoder
-from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_weight
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, all_finite, geman_mcclure_weight
 from sl_nerfstudio.pattern.boards import Board, CharucoBoard, Chessboard
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import ShownImage
@@ -314,7 +314,7 @@ def _carried(
     left, top = (max(0, int(c - reach)) for c in corner)
     right, bottom = min(w, int(corner[0] + reach) + 1), min(h, int(corner[1] + reach) + 1)
     part = coords[top:bottom, left:right]
-    rows, columns = np.nonzero(np.isfinite(part).all(-1))
+    rows, columns = np.nonzero(all_finite(part))
     if len(rows) < _LEAST_PIXELS:
         return None
     xy = (np.stack([columns + left, rows + top], -1) + 0.5 - corner) / reach

@@ -26,6 +26,7 @@ from sl_nerfstudio.console import track
 from sl_nerfstudio.decoding.decoder import Decoded, DecodingError
 from sl_nerfstudio.decoding.gray_code import decode_gray_code
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.scan.images import as_grey, encode_png, read_image
 from sl_nerfstudio.storage import write_atomic
@@ -165,7 +166,7 @@ class SequenceProgress:
         # at the nearest pixels: means across edges would be places that nothing shows
         coords = cv2.resize(decoded.coords, small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
         xy = coords / np.array([layout.w, layout.h], dtype=np.float32)
-        self.last = draw_pixels(small, xy, np.isfinite(xy).all(-1))
+        self.last = draw_pixels(small, xy, all_finite(xy))
 
 
 def start(layout: GrayCode) -> SequenceProgress:

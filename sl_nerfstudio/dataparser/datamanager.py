@@ -25,6 +25,7 @@ from sl_nerfstudio.dataparser.dataparser import (
     held_out_pixels,
 )
 from sl_nerfstudio.geometry.devices import Intrinsics
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.geometry.triangulation import pixel_rays
 from sl_nerfstudio.scan import Frame, Scan
 
@@ -56,12 +57,12 @@ class SLDataset(InputDataset):
         index = data["image_idx"]
         frame = self.scan.frames[index]
         coords = frame.read_coords()
-        mask = np.isfinite(coords).all(-1) if frame.mask_path is None else frame.read_mask()
+        mask = all_finite(coords) if frame.mask_path is None else frame.read_mask()
         images = {
             "coords": coords,
             "pattern": frame.read_pattern()[..., None],
             "mask": mask[..., None],
-            "decoded": (np.isfinite(coords).all(-1) & mask)[..., None],
+            "decoded": (all_finite(coords) & mask)[..., None],
             "held_out": (held_out_pixels(index, *mask.shape) & mask)[..., None],
         }
         return {name: torch.from_numpy(self._resized(index, image)) for name, image in images.items()}

@@ -26,7 +26,7 @@ from sl_nerfstudio.console import track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange
 from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.geometry.numerics import evenly_spaced
+from sl_nerfstudio.geometry.numerics import all_finite, evenly_spaced
 from sl_nerfstudio.geometry.triangulation import triangulate, upright
 from sl_nerfstudio.late_imports import begin_imports
 from sl_nerfstudio.parallel import read_at_random, read_in_order
@@ -288,7 +288,7 @@ def build_samples(scan: Scan, show_progress: bool = True) -> PixelSamples:
 def _frame_pixels(number: int, frame: Frame) -> Shaped[ndarray, "n"]:
     """The records of one frame."""
     coords = frame.read_coords()
-    mask = np.isfinite(coords).all(-1) if frame.mask_path is None else frame.read_mask()
+    mask = all_finite(coords) if frame.mask_path is None else frame.read_mask()
     row, column = mask.nonzero()
     out = np.zeros(len(row), dtype=_RECORD)
     out["frame"], out["row"], out["column"], out["coords"] = number, row, column, coords[mask]

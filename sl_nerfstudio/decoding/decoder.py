@@ -13,6 +13,7 @@ from numpy import ndarray
 from scipy.ndimage import find_objects
 
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.layout import PatternLayout
 from sl_nerfstudio.scan.images import Pixels
@@ -39,7 +40,7 @@ class Decoded:
     @property
     def decoded(self) -> Bool[ndarray, "h w"]:
         """Pixels that have coordinates."""
-        return np.isfinite(self.coords).all(-1)
+        return all_finite(self.coords)
 
     @property
     def rate(self) -> float:

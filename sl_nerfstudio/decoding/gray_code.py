@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Int8, Int16, Int32, Int64, UInt8, UInt16
 from numpy import ndarray
 
 from sl_nerfstudio.decoding.decoder import Coords, Decoded, DecodingError, Layer, Mask, drop_small_regions
-from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, solve_plane
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, all_finite, solve_plane
 from sl_nerfstudio.parallel import compiled
 from sl_nerfstudio.pattern.gray_code import GrayCode, gray, ungray
 from sl_nerfstudio.pattern.layout import HEAD, ShownImage
@@ -397,7 +397,7 @@ def decode_gray_code(images: Sequence[Image], layout: GrayCode) -> Decoded:
         finest.append(layout.cell * (1 if cells is None else cells.size))
         coords[..., axis] = _coordinates(photographs, axis, light, cells)
         stripes.append(_stripe_image(photographs, axis, light))
-    known = np.isfinite(coords).all(-1) & light.lit
+    known = all_finite(coords) & light.lit
     coords[~known] = np.nan
     coords = drop_small_regions(coords, _LARGEST_STEP * max(layout.cell, _usual_step(coords)), _LEAST_REGION)
     stripe = np.where(light.lit, (stripes[0] + stripes[1]) / 2, 0).astype(np.float32)

@@ -18,7 +18,7 @@ from sl_nerfstudio.console import track
 from sl_nerfstudio.evaluation.mesh_index import IndexedMesh
 from sl_nerfstudio.geometry.devices import Intrinsics, project
 from sl_nerfstudio.geometry.lie import DevicePoses, inverse, transform
-from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, all_finite
 from sl_nerfstudio.geometry.triangulation import epipolar_residual, pixel_rays, triangulate
 from sl_nerfstudio.parallel import results, threads
 from sl_nerfstudio.scan import Frame, Scan
@@ -173,7 +173,7 @@ def _wrong_patches(pixels: FramePixels, missing: Bool[ndarray, "h w"], count: in
     """Small patches, bounded by jumps of the coordinates, that are missing for the most part."""
     coords = _as_image(pixels, pixels.coords, np.nan)
     limit = _JUMP * pixels.footprint_px * pixels.stride + _SIGMAS * np.sqrt(2) * pixels.noise_px
-    inside = np.isfinite(coords).all(-1)
+    inside = all_finite(coords)
     for axis in (0, 1):
         jump = np.linalg.norm(np.diff(coords, axis=axis), axis=-1) > limit
         inside &= ~np.insert(jump, jump.shape[axis], False, axis) & ~np.insert(jump, 0, False, axis)

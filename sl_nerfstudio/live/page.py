@@ -18,6 +18,7 @@ from numpy import ndarray
 from sl_nerfstudio.capture.camera import draw_pixels
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import Similarity, centred_on
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.geometry.triangulation import upright
 from sl_nerfstudio.live.next_view import NextView
 from sl_nerfstudio.live.session import Row, Update
@@ -251,7 +252,7 @@ def decoded_picture(sight: Sight) -> UInt8[ndarray, "h w 3"]:
         return small
     coords = cv2.resize(sight.cloud.coords, size, interpolation=cv2.INTER_NEAREST)
     xy = coords / np.array([sight.cloud.projector.w, sight.cloud.projector.h], dtype=np.float32)
-    return draw_pixels(small, xy, np.isfinite(xy).all(-1))
+    return draw_pixels(small, xy, all_finite(xy))
 
 
 def picture_text(picture: UInt8[ndarray, "h w 3"]) -> str:

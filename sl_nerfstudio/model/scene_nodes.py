@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, unproject
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.geometry.triangulation import Viewpoint, beside, far_enough, triangulate_pixels
 
 SCENE_SCALE = 10.0
@@ -174,7 +175,7 @@ def decoded_points(
 
     Pixels whose rays meet behind a device are left out.
     """
-    row, column = _evenly(np.isfinite(coords).all(-1), most)
+    row, column = _evenly(all_finite(coords), most)
     found = triangulate_pixels(camera, projector, T_world_camera, T_world_projector, coords, row, column)
     return found.p_world[(found.depth_camera > 0) & (found.depth_projector > 0)].numpy()
 

@@ -15,7 +15,7 @@ from numpy import ndarray
 from scipy.spatial import KDTree
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project
-from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_weight
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, all_finite, geman_mcclure_weight
 from sl_nerfstudio.geometry.triangulation import epipolar_residual, triangulate
 from sl_nerfstudio.parallel import compiled, compiled_range
 
@@ -80,7 +80,7 @@ class DecodedFrame:
 
     def thinned(self, most: int) -> "DecodedFrame":
         """Keep every n-th pixel, so that at most about `most` are decoded."""
-        count = int(np.isfinite(self.coords).all(-1).sum())
+        count = int(all_finite(self.coords).sum())
         step = max(1, int(np.ceil(np.sqrt(count / most))))
         coords, seen = self.coords[::step, ::step].copy(), self.seen[::step, ::step].copy()
         return replace(self, coords=coords, seen=seen, stride=step * self.stride)
@@ -114,7 +114,7 @@ def points_of(frame: DecodedFrame) -> FramePoints:
 
     The noise of the coordinates is measured: the robust standard deviation of the epipolar residual.
     """
-    row, column = np.nonzero(np.isfinite(frame.coords).all(-1))
+    row, column = np.nonzero(all_finite(frame.coords))
     uv = torch.from_numpy(np.stack([column, row], -1) * float(frame.stride) + 0.5)
     pair = (
         Intrinsics.of(frame.camera, torch.float64), torch.from_numpy(frame.T_world_camera), uv,
@@ -125,7 +125,7 @@ def points_of(frame: DecodedFrame) -> FramePoints:
     residual = epipolar_residual(*pair).numpy()
     origin = frame.T_world_camera[:3, 3]
     p = found.p_world.numpy()
-    good = np.isfinite(residual) & np.isfinite(p).all(-1)
+    good = np.isfinite(residual) & all_finite(p)
     noise = MAD_TO_SIGMA * float(np.median(np.abs(residual[good]))) if good.any() else 0.0
     ray = p[good] - origin
     ray = ray / np.linalg.norm(ray, axis=1, keepdims=True)
@@ -269,7 +269,7 @@ class PointPool:
         joined = FramePoints(*(np.concatenate([vars(f)[key] for f in frames]) for key in vars(frames[0])))
         frame = np.repeat(np.arange(len(frames)), [len(f) for f in frames])
         pool = PointPool(joined, np.concatenate(list(normals)), frame)
-        return pool.chosen(np.isfinite(pool.normal).all(-1))
+        return pool.chosen(all_finite(pool.normal))
 
     def chosen(self, index: Int64[ndarray, "m"] | Bool[ndarray, "n"]) -> "PointPool":
         """Choose points by mask or by index."""

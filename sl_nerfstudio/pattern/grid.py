@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int8
 from numpy import ndarray
 
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.pattern.codes import SYMBOL_NAMES, SYMBOLS, WINDOW, code_array, hamming_margins, is_generated
 from sl_nerfstudio.pattern.layout import Lattice, PatternLayout, number, whole_number
 
@@ -91,7 +92,7 @@ def projected_light(
     `pictures` the pattern at several degrees of sharpness, of which the one counts that explains most: with another,
     fine parts of the pattern would seem darker than coarse ones.
     """
-    known = np.isfinite(coords).all(-1)
+    known = all_finite(coords)
     weight = known.astype(np.float32)
     grey = image.astype(np.float32) * weight
     image_means = gaussian_window(np.dstack([weight, grey, grey * grey]), sigma)

@@ -17,6 +17,7 @@ from sl_nerfstudio.decoding.decoder import DecodingError
 from sl_nerfstudio.decoding.gray_code import check_count, decode_gray_code, take_samples
 from sl_nerfstudio.decoding.gray_code_order import check_order, layout_of_images, possible_layouts, with_numbering
 from sl_nerfstudio.errors import UserError
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.pattern.files import read_layout
 from sl_nerfstudio.pattern.gray_code import GrayCode
 from sl_nerfstudio.pattern.layout import CENTRED, PatternLayout, SequenceName
@@ -342,7 +343,7 @@ def _require_resolution(captures: Captures, layout: GrayCode) -> None:
     w, h = captures.size
     stated = np.array([layout.columns, layout.rows])
     for frame, cells in _cells_of(whole, layout, max(1, max(w, h) // _SIDE)):
-        known = cells[np.isfinite(cells).all(-1)]
+        known = cells[all_finite(cells)]
         beyond = (known > stated + 0.5).mean(0) > _IMPOSSIBLE
         centred = (2 ** np.array(layout.bits) - stated) / 2  # by programs that count from the middle
         low = np.quantile(known, _BEYOND, axis=0)

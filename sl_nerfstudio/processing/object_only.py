@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Float32, UInt8, UInt16
 from numpy import ndarray
 
 from sl_nerfstudio.console import track
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.object_separation.planes import DecodedFrame, PlaneFinding, Verdict
 from sl_nerfstudio.object_separation.separate import Part, separate
 from sl_nerfstudio.processing.frames import FrameJob, FrameStageResult, FrameWorker, clouds_of, with_clouds
@@ -99,7 +100,7 @@ def only_object(
 
 
 def _shares(name: str, part: UInt8[ndarray, "h w"], coords: Float[ndarray, "h w 2"]) -> FrameShares:
-    shown = part[np.isfinite(coords).all(-1) & (part != Part.NOTHING)]
+    shown = part[all_finite(coords) & (part != Part.NOTHING)]
     count = max(len(shown), 1)
     return FrameShares(name, *(float((shown == kind).sum() / count) for kind in (Part.OBJECT, Part.PLANE, Part.BEYOND)))
 

@@ -13,7 +13,7 @@ from scipy.ndimage import find_objects, gaussian_filter
 from sl_nerfstudio.console import track
 from sl_nerfstudio.decoding.decoder import Coords, Layer, Mask, drop_small_regions
 from sl_nerfstudio.geometry.devices import Device, Intrinsics
-from sl_nerfstudio.geometry.numerics import evenly_spaced
+from sl_nerfstudio.geometry.numerics import all_finite, evenly_spaced
 from sl_nerfstudio.geometry.triangulation import pixel_centres, pixel_rays, world_pixels
 from sl_nerfstudio.meshing.extract import extract_mesh
 from sl_nerfstudio.meshing.mesh import Mesh
@@ -54,7 +54,7 @@ class Prediction:
     @property
     def known(self) -> Mask:
         """Pixels that have a prediction."""
-        return np.isfinite(self.coords).all(-1)
+        return all_finite(self.coords)
 
 
 class PredictedSurface:
@@ -179,11 +179,11 @@ def redecode_frame(
     neither image nor surface supports the decoded one. All others stay as they are.
     """
     shows = np.ones(image.shape, dtype=bool) if mask is None else mask
-    before = int(np.isfinite(decoded).all(-1).sum())
+    before = int(all_finite(decoded).sum())
     facts = RedecodedFacts(name, int(shows.sum()), before, 0, 0, 0, 0, 0, before, None, 0.0)
     stretch = _stretch(predicted.coords)
     usable = predicted.known & shows & (stretch < _COARSEST * ambiguity.pitch)
-    if not (usable & np.isfinite(decoded).all(-1)).any():
+    if not (usable & all_finite(decoded)).any():
         return decoded, facts
     box = find_objects(usable.astype(np.uint8))[0]
     view = PatternView(image[box], predicted.coords[box], predicted.depth[box], usable[box])
@@ -203,7 +203,7 @@ def _redecode(
     facts: RedecodedFacts,
 ) -> tuple[Coords, RedecodedFacts]:
     """Decode a view again of which some decoded pixels are usable; `facts` has the numbers before."""
-    pitch, old = ambiguity.pitch, np.isfinite(decoded).all(-1)
+    pitch, old = ambiguity.pitch, all_finite(decoded)
     checked = view.usable & old & _thinned(view.usable & old)
     # A decoded pixel that is as predicted stays as it is: it is measured only to learn from it.
     agrees = np.abs(decoded - view.coords).max(-1) < AGREES * pitch
@@ -223,7 +223,7 @@ def _redecode(
     out[tuple(places[changed].T)] = found.coords[changed]
     out[tuple(places[wrong].T)] = np.nan
     out = _without_specks(out, decoded, places[changed], pitch, pitch_px)
-    new, same = np.isfinite(out).all(-1), (out == decoded).all(-1)
+    new, same = all_finite(out), (out == decoded).all(-1)
     return out, replace(
         facts,
         added=int((new & ~old).sum()),
@@ -316,7 +316,7 @@ def _without_specks(
     coords: Coords, decoded: Coords, changed: Int64[ndarray, "n 2"], pitch: float, pitch_px: float
 ) -> Coords:
     """Regions of a few cells are no evidence: what was changed in them is as it was."""
-    kept = np.isfinite(drop_small_regions(coords, _TEAR * pitch, round(_CELLS * pitch_px**2))).all(-1)
+    kept = all_finite(drop_small_regions(coords, _TEAR * pitch, round(_CELLS * pitch_px**2)))
     back = changed[~kept[tuple(changed.T)]]
     out = coords.copy()
     out[tuple(back.T)] = decoded[tuple(back.T)]

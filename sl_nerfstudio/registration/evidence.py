@@ -21,6 +21,7 @@ from scipy.ndimage import uniform_filter
 
 from sl_nerfstudio.geometry.devices import Device, for_loops, pixel_of
 from sl_nerfstudio.geometry.lie import Similarities, Similarity, cross, rotated, row_times_rotation
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.parallel import both, compiled, compiled_range
 from sl_nerfstudio.registration.agreement import (
     AGREEING_SIGMAS,
@@ -141,7 +142,7 @@ def frame_evidence(cloud: FrameCloud) -> FrameEvidence:
     errors = np.stack([mean(values) for values in cloud.pose_errors.T], -1)
     normal = _normals(point)
     surface = np.stack([distance, sigma], -1).astype(np.float32)
-    usable = known & np.isfinite(normal).all(-1)
+    usable = known & all_finite(normal)
     step = max(1, round(float(np.sqrt(usable.sum() / POINTS))))
     some = np.zeros_like(usable)
     some[step // 2 :: step, step // 2 :: step] = True

@@ -10,7 +10,7 @@ from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
 from sl_nerfstudio.geometry.devices import Device, for_loops
-from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, nearest_distances, solve_plane
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, all_finite, nearest_distances, solve_plane
 from sl_nerfstudio.parallel import compiled_range
 from sl_nerfstudio.relative_pose.epipolar import correspondences_of, directions
 from sl_nerfstudio.relative_pose.estimation import RelativePose, RelativePoseError, agreeing_coords
@@ -401,7 +401,7 @@ def build_surface_map(cloud: FrameCloud) -> SurfaceMap:
     normal = _normals(fitted, ray, camera)
     cosine = -(normal * ray).sum(-1) / np.linalg.norm(ray, axis=-1)
     with np.errstate(invalid="ignore"):
-        valid = np.isfinite(point).all(-1) & (fitted[..., 0] > 0) & (cosine > LEAST_COSINE)
+        valid = all_finite(point) & (fitted[..., 0] > 0) & (cosine > LEAST_COSINE)
     depth = np.linalg.norm(np.nan_to_num(point), axis=-1)
     points, place = (point[valid], lattice.centres()[valid]) if valid.any() else (cloud.points, None)
     centroid, radius = centre_and_radius(points)

@@ -20,7 +20,7 @@ from numpy import ndarray
 from sl_nerfstudio.geometry.devices import Device, for_loops, ray_of, view_of
 from sl_nerfstudio.geometry.least_squares import NormalEquations, minimise
 from sl_nerfstudio.geometry.lie import cross, rotated, row_times_rotation
-from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_cost, geman_mcclure_weight
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, all_finite, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.parallel import compiled
 
 BLOCKS_ALONG = 25  # squares along the pattern's longer side; errors within one may depend on each other
@@ -82,7 +82,7 @@ def correspondences_of(
     """Camera pixel centres and pattern coordinates of the decoded pixels; of large images, of those on a lattice."""
     step = lattice_step(*coords.shape[:2])
     some = coords[::step, ::step]
-    row, column = np.nonzero(np.isfinite(some).all(-1))
+    row, column = np.nonzero(all_finite(some))
     return np.stack([column, row], -1) * step + 0.5, some[row, column].astype(np.float64)
 
 
@@ -97,7 +97,7 @@ def ray_pairs(
     A DOE has no ray beyond 90 degrees; coordinates that are not finite have none at all.
     """
     d_camera, (d_projector, by_uv) = directions(camera, uv_camera), directions_by_uv(projector, uv_projector)
-    usable = np.flatnonzero(np.isfinite(d_camera).all(-1) & np.isfinite(d_projector).all(-1))
+    usable = np.flatnonzero(all_finite(d_camera) & all_finite(d_projector))
     block = blocks_of(uv_projector[usable], projector)
     return RayPairs(d_camera[usable], d_projector[usable], by_uv[usable], block), usable
 

@@ -13,7 +13,7 @@ from numpy import ndarray
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import Similarity
-from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, geman_mcclure_weight
+from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, all_finite, geman_mcclure_weight
 from sl_nerfstudio.parallel import compiled, one_library_thread
 from sl_nerfstudio.relative_pose.candidates import (
     USUAL_COUNTS,
@@ -271,7 +271,7 @@ def agreeing_coords(
     `pose.inliers` are those of `correspondences_of(coords)`. Pixels between them are judged by the same rule, with the
     noise in their square of the pattern; if all of `pose.inliers` agree, these do.
     """
-    known, step = np.isfinite(coords).all(-1), lattice_step(*coords.shape[:2])
+    known, step = all_finite(coords), lattice_step(*coords.shape[:2])
     agrees = known.copy()
     if step > 1 and not pose.inliers.all():
         noise_px = _noise_by_block(coords, projector, pose)

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.least_squares import BlockEquations, minimise
-from sl_nerfstudio.geometry.numerics import geman_mcclure_cost, geman_mcclure_weight
+from sl_nerfstudio.geometry.numerics import all_finite, geman_mcclure_cost, geman_mcclure_weight
 from sl_nerfstudio.relative_pose.epipolar import (
     KERNEL_SIGMAS,
     RayPairs,
@@ -89,7 +89,7 @@ class PointMatches:
         parts = []
         for k, frame in enumerate(frames):
             d = directions(frame.camera, frame.uv_camera)
-            usable = np.flatnonzero(np.isfinite(d).all(-1) & np.isfinite(frame.uv_projector).all(-1))
+            usable = np.flatnonzero(all_finite(d) & all_finite(frame.uv_projector))
             if len(usable) > most:
                 usable = np.sort(rng.choice(usable, most, replace=False))
             uv = frame.uv_projector[usable]
@@ -237,7 +237,7 @@ class JointProblem:
         r, J = np.zeros(len(J_free)), np.zeros((len(J_free), 5))
         for part, R, t in zip(parts, state.R, state.t, strict=True):
             r[part], J[part] = sampson_jacobian(R, t, rays.chosen(part))
-        good = np.isfinite(r) & np.isfinite(J).all(-1) & np.isfinite(J_free).all(-1)
+        good = np.isfinite(r) & all_finite(J) & np.isfinite(J_free).all(-1)
         r, J, J_free = np.where(good, r, 0.0), np.where(good[:, None], J, 0.0), np.where(good[:, None], J_free, 0.0)
         w = np.where(good, geman_mcclure_weight((r / width) ** 2), 0.0)
         wJ, wr = w[:, None] * J, w * r

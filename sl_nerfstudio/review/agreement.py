@@ -23,6 +23,7 @@ from sl_nerfstudio.geometry.devices import Device, project
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity, centred_on, inverse, rotate, transform
 from sl_nerfstudio.geometry.numerics import (
     MAD_TO_SIGMA,
+    all_finite,
     component_labels,
     evenly_spaced,
     geman_mcclure_weight,
@@ -363,7 +364,7 @@ def triangulate_some(
     most: int,
 ) -> tuple[Float64[Tensor, "n 2"], Triangulation]:
     """Some decoded camera pixels, evenly chosen, and the points that their coordinates make of them."""
-    decoded = np.flatnonzero(np.isfinite(coords).all(-1))
+    decoded = np.flatnonzero(all_finite(coords))
     some = decoded[evenly_spaced(len(decoded), min(most, len(decoded)))]
     row, column = np.divmod(some, coords.shape[1])
     found = triangulate_pixels(camera, projector, T_world_camera, T_world_projector, coords, row, column)

@@ -20,6 +20,7 @@ from sl_nerfstudio.console import phase, track
 from sl_nerfstudio.errors import UserError
 from sl_nerfstudio.geometry.devices import IntrinsicsChange
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.meshing.extract import Field, extract_mesh
 from sl_nerfstudio.meshing.files import observed_points, write_mesh, write_points
 from sl_nerfstudio.meshing.finish import (
@@ -189,7 +190,7 @@ def separate_scan(scan: Scan, poses: DevicePoses) -> Separation:
     frames = []
     for k, frame in enumerate(track(scan.frames, "object only")):
         coords = frame.read_coords()
-        if np.isfinite(coords).all(-1).any():
+        if all_finite(coords).any():
             T = poses.T_world_camera[k], poses.T_world_projector[k]
             whole = DecodedFrame(frame.camera, scan.projector, *T, coords, frame.read_mask())
             frames.append(whole.thinned(PIXELS_PER_FRAME))

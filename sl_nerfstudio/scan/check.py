@@ -15,6 +15,7 @@ from numpy import ndarray
 from sl_nerfstudio.console import track
 from sl_nerfstudio.errors import Fault, ScanError
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, unproject
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.parallel import results, threads
 from sl_nerfstudio.scan.check_conventions import convention_problems
 from sl_nerfstudio.scan.check_geometry import Correspondences, GeometricFit, fit_geometry, sample_pixels
@@ -317,7 +318,7 @@ def _check_coords(files: _Files, frame: PartialFrame, projector: Device | None) 
 
 def _unit_problem(coords: Float32[ndarray, "h w 2"], stored: CoordinateFiles) -> Problem | None:
     """What is wrong with the stated unit of images: their numbers make sense in the other one only."""
-    values, size = coords[np.isfinite(coords).all(-1)], np.array(stored.pattern, dtype=np.float32)
+    values, size = coords[all_finite(coords)], np.array(stored.pattern, dtype=np.float32)
     if not len(values):
         return None
     low, high = values.min(0), values.max(0)

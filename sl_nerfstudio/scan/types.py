@@ -14,6 +14,7 @@ from numpy import ndarray
 from sl_nerfstudio.errors import Fault, ScanError
 from sl_nerfstudio.geometry.devices import UNCHANGED, Device, Intrinsics, IntrinsicsChange, project, unproject
 from sl_nerfstudio.geometry.lie import DevicePoses, Similarity
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.geometry.triangulation import pixel_rays, triangulate
 from sl_nerfstudio.scan.coordinates import CoordinateFiles
 from sl_nerfstudio.scan.document import TRANSFORMS, Faults, Fields, Problem
@@ -235,7 +236,7 @@ class Frame:
         """Pixels where the pattern falls on the object: the mask file, else where coordinates were decoded."""
         if self.mask_path is not None:
             return read_image(self.mask_path) > 0
-        return np.isfinite(self.read_coords()).all(-1)
+        return all_finite(self.read_coords())
 
     def read_masked_coords(self) -> Float32[ndarray, "h w 2"]:
         """Pattern coordinates where the mask allows them, NaN elsewhere."""
@@ -467,7 +468,7 @@ def measured_length(scan: Scan, bar: ScaleBar, poses: DevicePoses) -> float:
 def _surface_point(scan: Scan, end: PickedPixel, poses: DevicePoses) -> Float64[ndarray, "3"]:
     index = scan.index_of(end.frame)
     frame, coords = scan.frames[index], scan.frames[index].read_coords()
-    row, column = np.nonzero(np.isfinite(coords).all(-1))
+    row, column = np.nonzero(all_finite(coords))
     uv = np.stack([column, row], 1) + 0.5
     near = np.linalg.norm(uv - end.pixel, axis=1) < NEAR_PX
     camera, projector = Intrinsics.of(frame.camera, torch.float64), Intrinsics.of(scan.projector, torch.float64)

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from sl_nerfstudio.geometry.devices import Device, Intrinsics, project, unproject
 from sl_nerfstudio.geometry.lie import DevicePoses, exp_so3, fit_similarity, log_so3
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.geometry.triangulation import triangulate
 from sl_nerfstudio.scan.types import PoseSigma
 from sl_nerfstudio.synthesis.config import PathKind, SynthConfig
@@ -322,7 +323,7 @@ def _registered(
         torch.from_numpy(match.uv_projector),
     )
     p = points.p_world.numpy()
-    known = np.isfinite(p).all(-1)
+    known = all_finite(p)
     if known.sum() < _FEWEST_POINTS:
         return T_world_camera
     return fit_similarity(p[known], match.p_world[known], with_scale=False).matrix() @ T_world_camera

@@ -8,7 +8,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sl_nerfstudio.geometry.numerics import MAD_TO_SIGMA, component_labels, evenly_spaced, geman_mcclure_weight
+from sl_nerfstudio.geometry.numerics import (
+    MAD_TO_SIGMA,
+    all_finite,
+    component_labels,
+    evenly_spaced,
+    geman_mcclure_weight,
+)
 from sl_nerfstudio.parallel import compiled
 
 
@@ -62,3 +68,11 @@ def test_indices_are_the_nearest_to_an_exactly_even_spacing(length, count):
         exact = Fraction(k * (length - 1), max(count - 1, 1))
         assert abs(index[k] - exact) <= Fraction(1, 2)  # a float32 has 24 bits: it would end beyond the table
     assert len(evenly_spaced(0, 0)) == 0
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(1, 5))
+def test_vectors_are_finite_where_all_their_numbers_are(seed, n):
+    rng = np.random.default_rng(seed)
+    values = rng.choice([0.0, 1.0, np.nan, np.inf, -np.inf], (7, 3, n), p=[0.5, 0.3, 0.1, 0.05, 0.05])
+    assert np.array_equal(all_finite(values), np.isfinite(values).all(-1))
+    assert np.array_equal(all_finite(values[:, :0]), np.ones((7, 0), dtype=bool))

@@ -24,6 +24,7 @@ from sl_nerfstudio.evaluation.report.charts import (
 )
 from sl_nerfstudio.geometry.devices import Device
 from sl_nerfstudio.geometry.lie import DevicePoses
+from sl_nerfstudio.geometry.numerics import all_finite
 from sl_nerfstudio.geometry.triangulation import OUTLINE, beside, frustum, world_pixels
 from sl_nerfstudio.late_imports import open3d as o3d
 from sl_nerfstudio.meshing.finish import simplified
@@ -221,7 +222,7 @@ def decoded_at(
         left = np.flatnonzero((facing > best) & faces_and_falls_inside(points, normals, one.camera, T))
         pixel = world_pixels(one.camera, T, points[left])[0]
         column, row = np.floor(pixel).astype(np.int64).T
-        decoded = np.isfinite(one.read_coords()[row, column]).all(-1)
+        decoded = all_finite(one.read_coords()[row, column])
         left, pixel = left[decoded], pixel[decoded]
         seen = ~surface.occluded(points[left], T[:3, 3])
         left, pixel = left[seen], pixel[seen]
