@@ -144,7 +144,7 @@ def _in_this_process(captures: Path, config: Config) -> tuple[Sequence[FoundFram
     ]
     says = (
         *(f"{turn:.0f} deg" for turn in found.turns_deg),
-        "by order" * found.by_order,
+        "by order" * bool(found.by_order),
         "mixed" * (not found.ordered),
     )
     return frames, ", ".join(filter(None, says)) or "-"

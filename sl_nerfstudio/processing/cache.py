@@ -51,7 +51,7 @@ VERSIONS = {
     "projector": 1,  # estimated intrinsics: relative_pose/unknown_projector.py
     "test of intrinsics": 1,  # relative_pose/intrinsics.py
     "static projector": 1,  # registration/static_projector.py
-    "registration": 8,  # registration/
+    "registration": 9,  # registration/
     "adjustment": 13,  # processing/consistency.py, bundle_adjustment/, review/agreement.py
 }
 """Number of each stage. Raise it whenever the stage, or anything that it calls, may give another result from the same

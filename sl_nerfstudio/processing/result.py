@@ -439,7 +439,7 @@ def summarise(
         cross,
         bool(wrong),
         () if registration is None else registration.turns_deg,
-        registration is not None and registration.by_order,
+        () if registration is None else registration.by_order,
         None if moving is None else moving.share,
         moving is not None and moving.registered,
         () if adjusted is None else other_places(adjusted.modes, [cloud.name for cloud in clouds_of(results)]),

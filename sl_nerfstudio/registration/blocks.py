@@ -50,7 +50,7 @@ class Settled:
 class Sides:
     """What surfaces alone say of the sides of an object."""
 
-    by_order: bool = False  # they would have left more frames open than the order of capture did
+    by_order: tuple[int, ...] = ()  # frames that they would have left open, and the order of capture did not
     turns_deg: tuple[float, ...] = ()  # by which blocks may be turned, as far as they tell
 
 
@@ -111,8 +111,9 @@ class BlockReview:
         """What surfaces alone say of blocks, after `settled`."""
         open_ = self._left_open
         without = open_ if self._prior is None else self._open(self._turns_tried, with_order=False)
+        undecided, left = ({k for block in blocks for k in block.nodes} for blocks in (without, open_))
         return Sides(
-            sum(len(block.nodes) for block in without) > sum(len(block.nodes) for block in open_),
+            tuple(sorted(undecided - left)),
             _distinct(sorted(block.turn_deg for block in without if block.turn_deg >= LEAST_SIDE_DEG)),
         )
 

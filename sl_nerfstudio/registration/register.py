@@ -161,7 +161,7 @@ def accept_frames(names: tuple[str, ...], graph: ViewGraph, ordered: bool) -> Re
         tuple(_separate_poses(names, c, graph) for c in components[1:] if len(c) > 1),
         sides.turns_deg,
         ordered,
-        sides.by_order,
+        tuple(names[k] for k in sides.by_order),
     )  # fmt: skip
 
 

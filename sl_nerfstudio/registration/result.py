@@ -139,7 +139,7 @@ class Registration:
     separate: tuple[SeparatePoses, ...] = ()  # of the other components
     turns_deg: tuple[float, ...] = ()  # after which the surface looks the same, so that pairs contradict each other
     ordered: bool = True  # frames follow each other in the order of capture; False: stated, or found not to be so
-    by_order: bool = False  # which side each frame shows was decided by the order of capture
+    by_order: tuple[str, ...] = ()  # frames of which the order of capture decided which side they show
 
 
 def without_frames(registration: Registration, exclusions: Sequence[Exclusion]) -> Registration:

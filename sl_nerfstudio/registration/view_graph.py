@@ -284,7 +284,8 @@ class ViewGraph:
         """What surfaces alone say of the sides of the object, in the last assembly."""
         found = [review.sides() for review in self._reviews]
         return Sides(
-            any(one.by_order for one in found), tuple(sorted({turn for one in found for turn in one.turns_deg}))
+            tuple(sorted({k for one in found for k in one.by_order})),
+            tuple(sorted({turn for one in found for turn in one.turns_deg})),
         )
 
     def assembly(self, edges: Sequence[PairMatch], scan: ScanEvidence) -> Assembly:

@@ -255,7 +255,7 @@ class ScanFacts:
     cross: CrossFrameAgreement | None = None  # of the frames in the scan, in their order
     wrong_intrinsics: bool = False  # the captures contradict the stated intrinsics
     turns_deg: tuple[float, ...] = ()  # after which the surface looks the same, so that frames may be turned by them
-    by_order: bool = False  # frames fit at several sides, and the order of capture decided
+    by_order: tuple[str, ...] = ()  # frames that fit at several sides, of which the order of capture decided
     moving_share: float | None = None  # of the decoded pixels: what moves before cameras that stand still
     moving_registered: bool = False  # only this is in the scan
     other_places: tuple[OtherPlace, ...] = ()  # of frames in the scan
@@ -302,7 +302,7 @@ def reasons_of(facts: ScanFacts) -> Iterator[Reason]:
         if place.odds > _ACCEPTABLE_ODDS:
             yield Reason("poor" if place.odds > _POOR_ODDS else "acceptable", place.sentence(), "between")
     if facts.by_order:
-        yield _placed_by_order(facts.turns_deg)
+        yield _placed_by_order(facts.by_order, facts.turns_deg)
     elif facts.turns_deg:
         yield Reason("poor", symmetry_sentence(facts.turns_deg))
     if facts.pairs is not None:
@@ -393,20 +393,20 @@ def symmetry_sentence(turns_deg: Sequence[float]) -> str:
     )
 
 
-def _placed_by_order(turns_deg: Sequence[float]) -> Reason:
-    """Say what it means that the order of capture decided which side each frame shows."""
-    how = "each was placed by the order of capture, turned on from the one before as most are"
+def _placed_by_order(names: Sequence[str], turns_deg: Sequence[float]) -> Reason:
+    """Say what it means that the order of capture decided which side frames show."""
+    how = "placed by the order of capture, each turned on from the one before as most are"
     if not turns_deg:
         return Reason(
             "acceptable",
-            f"frames fit at several sides of the object; {how}. Unless they were captured in this order, in small "
-            "steps, they are at other sides than they show",
+            f"{listed(names)}: fit at several sides of the object; {how}. Unless they were captured in this order, in "
+            "small steps, they are at other sides than they show",
         )
     return Reason(
         "poor",
-        f"{_same_after(turns_deg)}, so nothing tells which side a frame shows; {how}. That is right if the frames were "
-        f"captured in this order, in steps of less than {min(turns_deg) / 2:.0f} degrees; to be certain, put something "
-        "beside it that looks different from all sides",
+        f"{listed(names)}: {_same_after(turns_deg)}, and nothing certain tells which side of it these show; {how}. "
+        f"That is right if the frames were captured in this order, in steps of less than {min(turns_deg) / 2:.0f} "
+        "degrees; to be certain, put something beside it that looks different from all sides",
     )
 
 

@@ -124,7 +124,7 @@ def test_frames_come_in_one_after_the_other(clouds, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("doubt", [{"by_order": True}, {"turns_deg": (90.0,)}, {}])
+@pytest.mark.parametrize("doubt", [{"by_order": (NAMES[1],)}, {"turns_deg": (90.0,)}, {}])
 def test_frames_that_fit_at_several_places_do_not_come_in(clouds, monkeypatch, doubt):
     """Every frame of a symmetric object does; of others, those with two projectors."""
     why = UndecidedProjector(NAMES[MOVED], 20.0)

@@ -153,6 +153,7 @@ def test_the_order_of_capture_keeps_what_surfaces_leave_open_and_that_is_said():
     one = BlockReview(Said(pairs(0.0), prior), dict(enumerate(NODES)))
     found = one.settled()
     assert sorted(found.decided) == list(range(FRAMES)) and one.sides().by_order
+    assert set(one.sides().by_order) < set(range(FRAMES))
     assert len(review(pairs(0.0), dict(enumerate(NODES))).decided) < FRAMES
 
 
