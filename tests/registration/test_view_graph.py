@@ -205,13 +205,13 @@ def test_what_is_taken_apart_is_looked_at_again_inside(monkeypatch):
             return Settled({k: self.nodes[k] for k in kept}, open_)
 
         def sides(self) -> Sides:
-            return Sides(len(self.nodes) < FRAMES, (90.0,))
+            return Sides(tuple(self.nodes) if len(self.nodes) < FRAMES else (), (90.0,))
 
     monkeypatch.setattr(module, "BlockReview", Review)
     monkeypatch.setattr(Assembly, "grow", lambda self: [{k: Similarity.identity() for k in range(FRAMES)}])
     assert [sorted(c) for c in graph.assemble()] == [[2, 3, 4], [0, 1], [5]]
     assert [(sorted(block.nodes), block.log_odds) for block in graph.open] == [([2, 3, 4], 4.0), ([5], 1.0)]
-    assert reviewed == [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5]] and graph.sides_of_object() == Sides(True, (90.0,))
+    assert reviewed == [[0, 1, 2, 3, 4, 5], [2, 3, 4, 5]] and graph.sides_of_object() == Sides((2, 3, 4, 5), (90.0,))
 
 
 # Rough camera poses as a start: baselines, and a common centre.
