@@ -394,6 +394,10 @@ class MapSample:
     valid: Bool[Tensor, "n"]  # enough decoded pixels, and a paraboloid fits them
     roughness: Float[Tensor, "n"]  # RMS distance of the window from it, projector pixels; infinite without a fit
 
+    def chosen(self, index: Tensor) -> "MapSample":
+        """Choose positions by mask or by index."""
+        return MapSample(self.uv_projector[index], self.jacobian[index], self.valid[index], self.roughness[index])
+
 
 @dataclass(frozen=True)
 class CoordinateMaps:

@@ -282,15 +282,16 @@ class PlaceOfFrame:
         chosen = owner == frame
         chosen[:: max(_OF_OTHERS, rig.frames)] = True
         owner, uv = owner[chosen], uv[chosen]
-        here = _End(rig, *anchors_at(rig, owner, uv, problem.maps.look_up(owner, uv)))
+        seen = problem.maps.look_up(owner, uv)
+        rays = surface_rays(rig, owner, uv, seen)
+        here = _End(rig, *anchors_on(rig, owner, seen, rays))
         generator = torch.Generator().manual_seed(problem.settings.seed)
         own = torch.arange(rig.frames) == frame
         numbers = here.numbers(problem.maps, allowed & (own | own[:, None]), generator)
         rows = _some(rig.frames, numbers, _FRAME_LOOK_UPS, generator)
         its = owner == frame
-        seen = problem.maps.look_up(owner[its], uv[its])
-        rays = surface_rays(rig, owner[its], uv[its], seen)
-        return PlaceOfFrame(problem, noise, here, _blocks(owner, uv), its, seen, rays, rows)
+        own_rays = rays[0][:, its], rays[1][:, its]
+        return PlaceOfFrame(problem, noise, here, _blocks(owner, uv), its, seen.chosen(its), own_rays, rows)
 
     def lead_of(self, other: Rig) -> float:
         """By how many of its standard errors a rig in which that frame alone is elsewhere is more probable."""

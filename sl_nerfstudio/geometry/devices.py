@@ -136,8 +136,8 @@ def undistort(xd: Tensor, yd: Tensor, k1: Tensor, k2: Tensor, p1: Tensor, p2: Te
         det = torch.where(det.abs() < LEAST_DETERMINANT, torch.full_like(det, LEAST_DETERMINANT), det)
         step_x, step_y = (d * ex - b * ey) / det, (a * ey - b * ex) / det
         x, y = x - step_x, y - step_y
-        if torch.maximum(step_x.detach().abs(), step_y.detach().abs()).lt(_LAST_STEP).all():
-            break
+        if x.device.type == "cpu" and torch.maximum(step_x.detach().abs(), step_y.detach().abs()).lt(_LAST_STEP).all():
+            break  # elsewhere, to ask would take longer than the steps: it waits for the device
     return x, y
 
 

@@ -14,8 +14,8 @@ from sl_nerfstudio.parallel import compiled
 
 def all_finite(values: Float[ndarray, "*batch n"]) -> Bool[ndarray, "*batch"]:
     """Whether all numbers along the last axis are finite; for few of them, 15 times as fast as numpy's `all`."""
-    found = np.isfinite(values[..., 0])
-    for k in range(1, values.shape[-1]):
+    found = np.ones(values.shape[:-1], dtype=bool)
+    for k in range(values.shape[-1]):
         found &= np.isfinite(values[..., k])
     return found
 

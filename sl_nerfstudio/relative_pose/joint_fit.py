@@ -237,7 +237,7 @@ class JointProblem:
         r, J = np.zeros(len(J_free)), np.zeros((len(J_free), 5))
         for part, R, t in zip(parts, state.R, state.t, strict=True):
             r[part], J[part] = sampson_jacobian(R, t, rays.chosen(part))
-        good = np.isfinite(r) & all_finite(J) & np.isfinite(J_free).all(-1)
+        good = np.isfinite(r) & all_finite(J) & all_finite(J_free)
         r, J, J_free = np.where(good, r, 0.0), np.where(good[:, None], J, 0.0), np.where(good[:, None], J_free, 0.0)
         w = np.where(good, geman_mcclure_weight((r / width) ** 2), 0.0)
         wJ, wr = w[:, None] * J, w * r

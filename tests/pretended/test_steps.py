@@ -1,5 +1,6 @@
 """A training step on a GPU: no tensors of two devices meet, and the host never waits."""
 
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -10,6 +11,7 @@ from benchmarks.pretended.recorder import PretendedRecorder
 from sl_nerfstudio.bundle_adjustment.adjust import CrossValidation
 from sl_nerfstudio.bundle_adjustment.covariance import joint_of_prior
 from sl_nerfstudio.field import device_kernels
+from sl_nerfstudio.geometry.devices import Device, Intrinsics, unproject
 from sl_nerfstudio.model.loop import WARM_UP
 from sl_nerfstudio.model.pose_refinement import ScanAdjustment, pose_prior, scene_rig
 
@@ -62,6 +64,17 @@ def test_no_step_waits_for_the_gpu(begin, monkeypatch, method, refine, poses, ba
         assert {"field.encoding.table", "field.mlp.0.weight"} <= moved
         assert ("device_poses.camera_step" in moved) == (poses != "adjust")
         assert training.model.history()["step"] == [0.0]
+
+
+def test_rays_of_a_distorted_lens_do_not_wait_for_the_gpu():
+    lens = Intrinsics.of(Device(640, 480, 600.0, 600.0, 320.0, 240.0, k1=-0.2, k2=0.05), torch.float32)
+    uv = 400 * torch.rand(100, 2, generator=torch.Generator().manual_seed(0))
+    with PretendedGpu(kernels=False) as gpu:
+        there, at = replace(lens, params=lens.params.to("cuda")), uv.to("cuda")
+        with gpu.counting() as seen:
+            found = unproject(there, at)
+        assert not seen.waits and seen.launches.total() > 20
+        torch.testing.assert_close(found.cpu(), unproject(lens, uv))
 
 
 def test_kernels_that_do_not_compile_are_said_before_the_first_step_and_plain_torch_is_used(begin, monkeypatch, capsys):
